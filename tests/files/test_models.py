@@ -259,7 +259,7 @@ def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplo
     assert "1 Room" in caplog.text
 
 
-def test_terrain_is_ground(tmp_path: Path):
+def test_terrain_is_ground_and_faces_up(tmp_path: Path, caplog):
     corners = np.array([[0, 0, 0], [40, 0, 1], [40, 30, 2], [0, 30, 0.5]]) + NATIONAL
     faces = [Face([corners[[0, 1, 2]]], "GroundSurface"), Face([corners[[0, 2, 3]]], "GroundSurface")]
     patches = "".join(made.polygon_gml(face.rings).replace("gml:Polygon", "gml:Triangle") for face in faces)
@@ -267,6 +267,7 @@ def test_terrain_is_ground(tmp_path: Path):
     relief = f"<dem:TINRelief><dem:lod>2</dem:lod><dem:tin>{tin}</dem:tin></dem:TINRelief>"
     relief = f"<dem:reliefComponent>{relief}</dem:reliefComponent>"
     assert_cast_as(save(tmp_path / "a.gml", made.citygml(relief, kind="dem:ReliefFeature")), faces)
+    assert "face down" not in caplog.text
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -442,6 +443,8 @@ def test_parts_are_of_the_class_of_their_whole_and_their_glass_is_window(tmp_pat
     [
         (lambda text: text[: len(text) // 2], "does not end as an IFC does"),
         (lambda text: "no step\n" + text[-200:], "may be cut off or damaged"),
+        (lambda text: text.replace("'IFC4'", "'IFC4X3_RC4'"), "is IFC4X3_RC4, which is not read: export it as IFC2X3,"),
+        (lambda text: re.sub("IFCPROJECT\\(", "IFCPROJECTLIBRARY(", text), "it has no IfcProject"),
         (lambda text: re.sub("IFC(WALL|WINDOW|DOOR|SLAB)\\(", "IFCFURNISHINGELEMENT(", text), "has no walls, roofs"),
     ],
 )
@@ -450,6 +453,46 @@ def test_an_ifc_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable,
     path.write_text(change(path.read_text()))
     with pytest.raises(SceneError, match=words):
         read_geometry(path)
+
+
+HEADERS = [
+    (r"^", "\ufeff"),
+    (r"FILE_NAME\('[^']*'", r"FILE_NAME('C:\\\\Temp\\\\house.ifc'"),
+    (r"FILE_DESCRIPTION\(.*?\);\s*FILE_NAME\(.*?\);", ""),
+    (r"IFC4X3_ADD2", "IFC4X3"),  # as Revit writes it
+    (r"IFC4X3_ADD2", "IFC4X3_ADD1"),
+]
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+@pytest.mark.parametrize(("words", "others"), HEADERS)
+def test_headers_that_programs_write_are_read(tmp_path: Path, words: str, others: str, zipped: bool):
+    path = made.ifc_house(schema="IFC4X3").save(tmp_path / "a.ifc")
+    text, changed = re.subn(words, others, path.read_text(), count=1, flags=re.DOTALL)
+    assert changed
+    path.write_text(text, encoding="utf-8")
+    if zipped:
+        with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
+            archive.write(path, "a.ifc")
+    assert_cast_as(tmp_path / ("a.ifczip" if zipped else "a.ifc"), made.ifc_house_faces())
+
+
+def test_the_map_of_an_ifc_in_degrees_is_told(tmp_path: Path, caplog):
+    file = made.ifc_house(schema="IFC4X3")
+    crs = file.add("IfcGeographicCRS", "EPSG:4258")
+    degrees = (file.add("IfcPlaneAngleMeasure", value) for value in (14.09, 46.36))
+    file.add("IfcRigidOperation", file.context, crs, *degrees, 475.0)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), made.ifc_house_faces())
+    assert "its map, EPSG:4258, is in degrees: its parts keep the coordinates of the model" in caplog.text
+
+
+@pytest.mark.parametrize("schema", ["IFC2X3", "IFC4"])
+def test_what_reinforces_concrete_is_left_out_of_every_ifc(tmp_path: Path, caplog, schema: str):
+    file = made.Ifc(schema=schema)
+    file.block("IfcBeam", (0, 0, 0), (6, 0.3, 0.5))
+    file.block("IfcReinforcingMesh", (0.1, 0.1, 0.1), (5.9, 0.2, 0.2))
+    assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 12
+    assert "left out what is no outside of a building: 1 IfcReinforcingMesh" in caplog.text
 
 
 @pytest.mark.parametrize("beside_a_body", [True, False])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import (
@@ -31,6 +31,8 @@ _CLASSES = {
     **dict.fromkeys(("Window", "WindowSurface"), SurfaceClass.WINDOW),
     **dict.fromkeys(("Door", "DoorSurface"), SurfaceClass.DOOR),
 }
+_UPWARDS = {"RoofSurface": 1, "GroundSurface": -1}
+"""Which surfaces of a building face up, and which down. Terrain is ground, but faces up."""
 _OPENINGS = ("Window", "WindowSurface", "Door", "DoorSurface")
 _INSIDE = ("InteriorWallSurface", "CeilingSurface", "FloorSurface")
 _NOTHING = "ClosureSurface"
@@ -88,7 +90,7 @@ class _Outside:
     """The polygons of all objects that are seen from outside, each once, with their classes, and what was left out."""
 
     def __init__(self) -> None:
-        self.polygons: list[list[np.ndarray]] = []
+        self.polygons: list[Polygon] = []
         self.classes: list[SurfaceClass] = []
         self.left, self.levels = Counter[str](), Counter[float]()
         self._known: set[bytes] = set()
@@ -122,7 +124,7 @@ class _Outside:
         if polygon.surface in (*_INSIDE, _NOTHING):
             self.left[polygon.surface] += 1
             return
-        self.polygons.append(polygon.rings)
+        self.polygons.append(polygon)
         self.classes.append(known_class or _CLASSES.get(polygon.surface, SurfaceClass.OTHER))
 
 
@@ -144,7 +146,7 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     for city_object in objects:
         found.add(city_object)
     say_left_out(path, found.left + missing)
-    rings = [ring for polygon in found.polygons for ring in polygon]
+    rings = [ring for polygon in found.polygons for ring in polygon.rings]
     if not rings:
         raise SceneError(f"the shell {path} has no surface of a building, a bridge, a tunnel or terrain")
     levels = (f"LoD {level:g} of {count}" for level, count in sorted(found.levels.items(), reverse=True))
@@ -152,13 +154,14 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     points = np.concatenate([NO_POINTS, *rings])
     refuse_degrees(points, path)
     vertices, corners = np.unique(points, axis=0, return_inverse=True)
-    holes = np.array([k > 0 for polygon in found.polygons for k in range(len(polygon))])
+    holes = np.array([k > 0 for polygon in found.polygons for k in range(len(polygon.rings))])
     sizes = np.array([len(ring) for ring in rings])
     cut = triangulated(vertices, sizes, corners.reshape(-1), holes)
     left_out(path, int((sizes[~holes] < 3).sum()), int((~holes).sum()), "polygons, which have fewer than 3 corners")
     say_missed(path, len(cut.missed), int((~holes).sum()))
     classes = np.array(found.classes, np.uint8)[cut.polygon]
-    _tell_if_mirrored(area_vectors(vertices, cut.faces)[:, 2], classes, path)
+    up = np.array([_UPWARDS.get(polygon.surface, 0) for polygon in found.polygons])[cut.polygon]
+    _tell_if_mirrored(up * area_vectors(vertices, cut.faces)[:, 2], path)
     return Geometry(vertices, cut.faces, classes=classes, drawn=True)
 
 
@@ -167,9 +170,13 @@ def ring_of(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
     return points[(points != np.roll(points, 1, axis=0)).any(axis=1)] if len(points) > 1 else points
 
 
-def _tell_if_mirrored(upwards: Float64[np.ndarray, " F"], classes: UInt8[np.ndarray, " F"], path: Path) -> None:
-    """Warn of roofs that face down: polygons wind inwards, or the axes are swapped, which no rotation undoes."""
-    known = np.select([classes == SurfaceClass.ROOF, classes == SurfaceClass.GROUND], [upwards, -upwards], 0.0)
+def _tell_if_mirrored(known: Float64[np.ndarray, " F"], path: Path) -> None:
+    """Warn of roofs that face down: polygons wind inwards, or the axes are swapped, which no rotation undoes.
+
+    Args:
+        known: areas of triangles that are known to face up or down, seen from there, negative from the other side.
+        path: the file.
+    """
     if known.sum() < -0.5 * np.abs(known).sum():
         notice(
             f"{path}: its roofs face down, so that its polygons are wound inwards, which does not matter, or its "

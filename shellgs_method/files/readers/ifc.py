@@ -1,4 +1,4 @@
-"""Read IFC, 2x3 and 4: what of a building is seen from outside, in metres and the coordinates of its map, if given."""
+"""Read IFC 2x3, 4 and 4x3: what is seen from outside, in metres and the coordinates of its map, if given."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
@@ -21,6 +23,17 @@ from shellgs_method.geometry.triangles import stacked
 from shellgs_method.machine.extras import import_extra
 
 _END = b"END-ISO-10303-21"
+_SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
+_EDITION = re.compile(r"(IFC2X3|IFC4|IFC4X3)(_TC\d|_ADD\d|_FINAL)*")
+"""Editions that differ in nothing that is read here; release candidates and IFC4X1 do."""
+_DATA = re.compile(rb"^\s*DATA\s*;", re.IGNORECASE | re.MULTILINE)
+_HEADER = b"""ISO-10303-21;
+HEADER;
+FILE_DESCRIPTION((''),'2;1');
+FILE_NAME('','',(''),(''),'','','');
+FILE_SCHEMA(('%s'));
+ENDSEC;
+"""
 _CLASSES = {
     "IfcWindow": SurfaceClass.WINDOW,
     "IfcDoor": SurfaceClass.DOOR,
@@ -80,7 +93,9 @@ def read_ifc(path: Path) -> Geometry:
     if path.suffix.lower() == ".ifc" and _END not in path.read_bytes()[-1000:]:
         raise ValueError("it does not end as an IFC does")
     ifcopenshell.get_log()  # which empties it
-    model: Any = ifcopenshell.open(str(path))
+    model: Any = _opened(path, ifcopenshell)
+    if not model.by_type("IfcProject"):
+        raise ValueError("it has no IfcProject")
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     _complete(path, model, products)
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
@@ -97,10 +112,8 @@ def read_ifc(path: Path) -> Geometry:
             f"{path}: the geometry of {len(failed)} of {len(seen)} parts cannot be made, such as {failed[0].is_a()} "
             f"{failed[0].GlobalId}."
         )
-    faults = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error]")]
-    if faults:
-        first = re.sub(r"\[.*?\] *", "", faults[0])
-        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
+    if faults := _faults(ifcopenshell):
+        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {faults[0]}.")
     if not made:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
     vertices, faces = stacked((part.vertices, part.faces) for part in made)
@@ -110,6 +123,49 @@ def read_ifc(path: Path) -> Geometry:
         classes=np.concatenate([part.classes for part in made]),
         drawn=True,
     )
+
+
+def _opened(path: Path, ifcopenshell: ModuleType) -> Any:
+    """The model.
+
+    ifcopenshell knows one edition of each schema, and refuses headers that break STEP's rules, as those with a mark of
+    the byte order, or with single backslashes in a path of Windows: what begins with DATA is read under a new one.
+    """
+    try:
+        return ifcopenshell.open(path)
+    except ifcopenshell.Error as error:
+        data = _unpacked(path)
+        named, begin = _SCHEMA.search(data), _DATA.search(data)
+        if not named or not begin:
+            raise
+        schema = named[1].decode("ascii", "replace").upper()
+        if not (edition := _EDITION.fullmatch(schema)):
+            raise SceneError(
+                f"the shell {path} is {schema}, which is not read: export it as IFC2X3, IFC4 or IFC4X3"
+            ) from error
+    known = "IFC4X3_ADD2" if edition[1] == "IFC4X3" else edition[1]
+    with TemporaryDirectory() as folder:
+        copy = Path(folder, "model.ifc")
+        copy.write_bytes(_HEADER % known.encode() + data[begin.start() :])
+        ifcopenshell.get_log()
+        try:
+            return ifcopenshell.open(copy)
+        except ifcopenshell.Error as error:
+            raise ValueError(next(iter(_faults(ifcopenshell)), str(error))) from error
+
+
+def _unpacked(path: Path) -> bytes:
+    """The text of a model, of the first in a zip."""
+    if path.suffix.lower() == ".ifc":
+        return path.read_bytes()
+    with ZipFile(path) as archive:
+        return archive.read(next(name for name in archive.namelist() if name.lower().endswith(".ifc")))
+
+
+def _faults(ifcopenshell: ModuleType) -> list[str]:
+    """What ifcopenshell has logged as errors since the last time, which empties its log."""
+    lines = ifcopenshell.get_log().splitlines()
+    return [re.sub(r"\[.*?\] *", "", line) for line in lines if line.startswith("[error]")]
 
 
 class _Part(NamedTuple):
@@ -180,7 +236,7 @@ def _identifiers(product: Any) -> set[str | None]:
 def _class_of(product: Any, ifcopenshell: ModuleType) -> SurfaceClass | None:
     """The class of a product, or else of what it is a part of; None for what is not seen from outside."""
     names = {name for name in (*_SEEN, *_CLASSES, *_UNSEEN, "IfcSlab") if _is(product, name)}
-    if not names & {*_SEEN}:
+    if not names & {*_SEEN} or _is(product, "IfcReinforcingElement"):  # which IFC 2x3 counts among building elements
         return None
     predefined = str(ifcopenshell.util.element.get_predefined_type(product) or "").upper()
     if any(predefined in _UNSEEN[name] for name in names & _UNSEEN.keys()):
@@ -257,8 +313,12 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points
+    crs = ifcopenshell.util.geolocation.get_crs(model) or {}
+    if crs.get("type") == "IfcGeographicCRS":
+        notice(f"{path}: its map, {crs['Name']}, is in degrees: its parts keep the coordinates of the model.")
+        return points
     unit = ifcopenshell.util.unit.calculate_unit_scale(model)
-    metres = _metres_of_map((ifcopenshell.util.geolocation.get_crs(model) or {}).get("MapUnit"), path)
+    metres = _metres_of_map(crs.get("MapUnit"), path)
     metres = metres or unit / known.scale
     scale = known.scale * metres / unit  # near 1: the scale of the map's projection
     if abs(scale - 1) > _PROJECTION and known.scale == 1:
