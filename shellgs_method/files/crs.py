@@ -43,7 +43,9 @@ _SPELT: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = tup
 """Names that PROJ does not know, and their codes: OpenDroneMap's, those of German surveys (their heights are left out),
 GML 2's, OGC's of two, EPSG's without a colon or with a blank, and PROJ's names before a code, as Metashape has them."""
 _IN_FILES = {
-    **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
+    ".ifc": re.compile(
+        rb"(?:IFCPROJECTEDCRS\s*\(\s*|'Name'\s*,[^,]*,\s*IFC\w+\s*\(\s*(?='EPSG:))'([^']+)'", re.IGNORECASE
+    ),
     **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),
     **dict.fromkeys((".json", ".jsonl", ".cityjson"), re.compile(rb'"referenceSystem"\s*:\s*"([^"]+)"')),
 }

@@ -51,6 +51,7 @@ def write_text(text: str):
         ("a.las", write_las, UTM),
         ("a.e57", write_e57, UTM),
         ("a.ifc", write_text("#9=IFCPROJECTEDCRS('EPSG:25832','UTM 32',$,$,$,$,$);"), UTM),
+        ("a.ifc", write_text("#9=IFCPROPERTYSINGLEVALUE('Name',$,IFCLABEL('EPSG:25832'),$);"), UTM),  # of 2x3
         ("a.gml", write_text('<gml:Envelope srsName="urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::5783">'), "EPSG:5555"),
         (
             "a.json",

@@ -358,7 +358,10 @@ def test_an_ifc_is_cast_to_a_millimetre_with_its_openings_as_they_are(tmp_path: 
     assert "1 IfcFurnishingElement, 3 IfcOpeningElement, 1 IfcSpace" in caplog.text
 
 
-SCALES = [(0.001, 0.001, None), (0.001, 0.001, 1.0), (1.0, 1.0, None), (0.001, 1.0, 1.0), (1.0, 0.9996, 1.0)]
+SCALES = [
+    *((0.001, 0.001, None), (0.001, 0.001, 1.0), (1.0, 1.0, None), (0.001, 1.0, 1.0), (1.0, 0.9996, 1.0)),
+    *((1.0, 0.9996, None), (0.3048, 0.3048, None), (0.001, 1000.0, None), (0.001, 1000.0, 1.0)),
+]
 
 
 @pytest.mark.parametrize(("unit", "scale", "map_unit"), SCALES)
@@ -375,6 +378,7 @@ def test_the_map_conversion_of_an_ifc_is_applied(
     faces = [Face([ring * shrunk for ring in face.rings], face.surface) for face in made.ifc_house_faces()]
     assert_cast_as(file.save(tmp_path / "a.ifc"), turned(faces, 30, NATIONAL))
     assert ("leaves out the scale" in caplog.text) == (unit != 1 and scale == 1)
+    assert ("has a scale of 1000 and not of 0.001" in caplog.text) == (scale == 1000)
 
 
 def test_a_map_conversion_in_the_units_of_the_model_is_said(tmp_path: Path, caplog):
@@ -399,15 +403,22 @@ def test_a_map_conversion_of_a_model_on_the_map_is_not_applied_again(tmp_path: P
     assert "its parts have the coordinates of the map already: its map conversion is not applied again" in caplog.text
 
 
-def test_the_map_conversion_of_an_ifc_2x3_is_in_property_sets(tmp_path: Path):
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(("name", "of"), [("ePSet_MapConversion", "IfcProject"), ("EPset_MapConversion", "IfcSite")])
+def test_the_map_conversion_of_an_ifc_2x3_is_in_property_sets(tmp_path: Path, name: str, of: str, text: bool):
     file = made.ifc_house(schema="IFC2X3", unit=1.0)
-    values = {"Eastings": NATIONAL[0], "Northings": NATIONAL[1], "OrthogonalHeight": NATIONAL[2]}
+    values = dict(zip(("Eastings", "Northings", "OrthogonalHeight"), NATIONAL.tolist(), strict=True))
     properties = [
-        file.add("IfcPropertySingleValue", name, None, file.add("IfcReal", float(value)))
-        for name, value in values.items()
+        file.add(
+            "IfcPropertySingleValue",
+            each,
+            None,
+            file.add("IfcText", str(value)) if text else file.add("IfcReal", value),
+        )
+        for each, value in values.items()
     ]
-    owned = file.add("IfcPropertySet", file.new(), None, "ePSet_MapConversion", None, properties)
-    file.add("IfcRelDefinesByProperties", file.new(), None, None, None, [file.project], owned)
+    owned = file.add("IfcPropertySet", file.new(), None, name, None, properties)
+    file.add("IfcRelDefinesByProperties", file.new(), None, None, None, file.model.by_type(of), owned)
     assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
 
 

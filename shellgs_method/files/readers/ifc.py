@@ -67,9 +67,10 @@ _NO_SURFACE = {
 """Identifiers of representations that are not what is seen of a product, though some are solids."""
 _PASSING = ("DEMOLISH", "TEMPORARY")
 """Status of parts that do not stay."""
+_MAP_SETS = {name.lower(): name for name in ("ePSet_MapConversion", "ePSet_ProjectedCRS")}
 _PROJECTION = 0.01
 """Largest difference of a map's scale from 1."""
-_FOOT = 0.3048
+_FEET = _FOOT, _ = 0.3048, 1200 / 3937
 _BEYOND = 1e8
 """Metres that no easting or northing reaches."""
 _TWICE = 10_000.0
@@ -185,7 +186,7 @@ def _read(shape: Any, own: SurfaceClass | None) -> _Part:
 
 
 def _complete(path: Path, model: Any, products: list) -> None:
-    """Give shapes without a context one of their kind, and tell of parts without a placement: both break IFC's rules.
+    """Give shapes without a context one of their kind, tell of parts without a placement, and move sets of a map.
 
     ifcopenshell leaves out shapes without a context, and does not cut such openings, without a word.
     """
@@ -202,6 +203,11 @@ def _complete(path: Path, model: Any, products: list) -> None:
             f"{path}: {len(nowhere)} of {len(products)} parts have a shape but no placement, against IFC, such as "
             f"{nowhere[0].is_a()} {nowhere[0].GlobalId}: they are put at the origin, and openings are cut there."
         )
+    for each in model.by_type("IfcPropertySet"):  # of IFC 2x3, which guides want at the project or at the site
+        if (name := _MAP_SETS.get(str(each.Name).lower())) and model.schema == "IFC2X3":
+            each.Name = name
+            link = model.create_entity("IfcRelDefinesByProperties", RelatingPropertyDefinition=each)
+            link.RelatedObjects = model.by_type("IfcProject")
 
 
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
@@ -313,24 +319,13 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points
+    known = known._make(map(float, known))  # numbers of property sets may be text
     crs = ifcopenshell.util.geolocation.get_crs(model) or {}
     if crs.get("type") == "IfcGeographicCRS":
         notice(f"{path}: its map, {crs['Name']}, is in degrees: its parts keep the coordinates of the model.")
         return points
     unit = ifcopenshell.util.unit.calculate_unit_scale(model)
-    metres = _metres_of_map(crs.get("MapUnit"), path)
-    metres = metres or unit / known.scale
-    scale = known.scale * metres / unit  # near 1: the scale of the map's projection
-    if abs(scale - 1) > _PROJECTION and known.scale == 1:
-        notice(
-            f"{path}: its map conversion leaves out the scale of {unit / metres:g} between its units: it is applied."
-        )
-        scale = 1.0
-    if abs(scale - 1) > _PROJECTION:
-        raise SceneError(
-            f"the shell {path} is scaled by {scale:g} in its map conversion: correct its Scale, which should be "
-            f"{unit / metres:g} for units of {unit:g} m and a map in {metres:g} m"
-        )
+    metres, scale = _scaled(known.scale, unit, _metres_of_map(crs.get("MapUnit"), path), path)
     origin = ifcopenshell.util.geolocation.get_wcs(model)
     if origin is not None:
         points = transformed(points, np.linalg.inv(origin * np.array([[1, 1, 1, unit]] * 3 + [[1, 1, 1, 1]])))
@@ -345,6 +340,39 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     turn = np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]])
     factors = scale * np.array([known.factor_x, known.factor_y, known.factor_z])
     return (points * factors) @ turn.T + place
+
+
+def _scaled(given: float, unit: float, named: float | None, path: Path) -> tuple[float, float]:
+    """Metres of the unit of a map, and how much its projection scales lengths.
+
+    Args:
+        given: scale of the map conversion, from the unit of the model to that of the map.
+        unit: metres of the unit of the model.
+        named: metres of the unit of the map; None if it names none, as it may where it is that of the model.
+        path: the file, for what is said of its units.
+
+    Raises:
+        SceneError: the scale is none between such units.
+    """
+    units = [named] if named else [unit, 1.0, *_FEET]
+    metres, scale = min(((each, given * each / unit) for each in units), key=lambda pair: abs(pair[1] - 1))
+    if abs(scale - 1) <= _PROJECTION:
+        return metres, scale
+    metres = named or 1.0
+    if given == 1:
+        notice(
+            f"{path}: its map conversion leaves out the scale of {unit / metres:g} between its units: it is applied."
+        )
+    elif abs(given * unit / metres - 1) <= _PROJECTION:
+        notice(
+            f"{path}: its map conversion has a scale of {given:g} and not of {unit / metres:g}, as between its units."
+        )
+    else:
+        raise SceneError(
+            f"the shell {path} is scaled by {given * metres / unit:g} in its map conversion: correct its Scale, which "
+            f"should be {unit / metres:g} for units of {unit:g} m and a map in {metres:g} m"
+        )
+    return metres, 1.0
 
 
 def _metres_of_map(unit: Any, path: Path) -> float | None:
