@@ -249,6 +249,18 @@ def test_footprints_are_left_out_whatever_their_dimension(tmp_path: Path, caplog
     assert "1 footprint (LoD 0)" in caplog.text
 
 
+@pytest.mark.parametrize("declared_by", ["gml:MultiSurface", "gml:posList"])
+def test_roads_on_a_plan_do_not_keep_buildings_from_being_read(tmp_path: Path, caplog, declared_by: str):
+    corners = np.array([[0, 0], [9, 0], [9, 9], [0, 9]])
+    road = f"<veg:lod1MultiSurface>{made.multi_surface([Face([corners], '')])}</veg:lod1MultiSurface>"
+    road = road.replace(f"<{declared_by}>", f'<{declared_by} srsDimension="2">')
+    text = made.citygml(made.surfaces_gml(moved(house()), "2.0"))
+    member = f"<core:cityObjectMember><veg:Road>{road}</veg:Road></core:cityObjectMember>"
+    text = text.replace("</core:CityModel>", f"{member}</core:CityModel>")
+    assert_cast_as(save(tmp_path / "a.gml", text), moved(house()))
+    assert "1 polygon without heights" in caplog.text
+
+
 def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):
     faces = moved(house())
     inside = moved(house(), NATIONAL + np.array([0, 0, -1.0]))

@@ -84,6 +84,11 @@ class _Model:
         ids = ((e, next((v for k, v in e.attrib.items() if k.endswith("}id")), None)) for e in self.root.iter())
         return {name: element for element, name in ids if name}
 
+    @cached_property
+    def flat(self) -> set[ET.Element]:
+        """Elements of geometries with two coordinates a corner."""
+        return {part for whole in self.root.iter() if whole.get("srsDimension") == "2" for part in whole.iter()}
+
     def linked(self, element: ET.Element) -> ET.Element | None:
         """What an element links to in this file; None if it has no link, or to what is not there."""
         href = element.get(_HREF)
@@ -167,21 +172,24 @@ class _Model:
         text = parts["transformationMatrix"].text if "transformationMatrix" in parts else None
         matrix = numbers_in(text).reshape(4, 4) if text else np.eye(4)
         point = self.linked(parts["referencePoint"])
-        at = self._points(parts["referencePoint"] if point is None else point)[0]
+        at = _positions(self._numbers(parts["referencePoint"] if point is None else point))[0]
         for rings in self._polygons(template, depth + 1):
             yield [ring @ matrix[:3, :3].T + matrix[:3, 3] + at for ring in rings]
 
     def _rings(self, polygon: ET.Element) -> list[Float64[np.ndarray, "N 3"]]:
-        """Outline and holes of a polygon; none where a side is curved."""
+        """Outline and holes of a polygon; none where a side is curved, or without heights, as roads on a plan have."""
         if any(_name(each) in _CURVED for each in polygon.iter()):
             self.missing["polygon with curved sides"] += 1
             return []
         bounds = [(side, child) for child in polygon if (side := _RINGS.get(_name(child))) is not None]
-        found = [ring_of(self._points(child)) for _, child in sorted(bounds, key=lambda bound: bound[0])]
+        if self.flat and any(each in self.flat for each in polygon.iter()):
+            self.missing["polygon without heights"] += 1
+            return []
+        found = [ring_of(_positions(self._numbers(child))) for _, child in sorted(bounds, key=lambda bound: bound[0])]
         return found
 
-    def _points(self, element: ET.Element) -> Float64[np.ndarray, "N 3"]:
-        """Positions below an element, in all the ways in which GML writes them."""
+    def _numbers(self, element: ET.Element) -> Float64[np.ndarray, " N"]:
+        """Coordinates below an element, in all the ways in which GML writes them."""
         found: list[np.ndarray] = []
         for each in element.iter():
             name, text = _name(each), each.text or ""
@@ -192,8 +200,11 @@ class _Model:
                     text = text.replace(each.get(sign) or usual, read)
                 found.append(numbers_in(text))
             elif name == "pointProperty" and (point := self.linked(each)) is not None:
-                found.append(self._points(point).ravel())
-        numbers = np.concatenate(found) if found else np.empty(0)
-        if len(numbers) % 3:
-            raise ValueError(f"a ring has {len(numbers)} numbers, which are no positions of 3 coordinates")
-        return numbers.reshape(-1, 3)
+                found.append(self._numbers(point))
+        return np.concatenate(found) if found else np.empty(0)
+
+
+def _positions(numbers: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, "N 3"]:
+    if len(numbers) % 3:
+        raise ValueError(f"a ring has {len(numbers)} numbers, which are no positions of 3 coordinates")
+    return numbers.reshape(-1, 3)
