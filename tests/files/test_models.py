@@ -164,6 +164,18 @@ def test_a_cityjson_that_cannot_be_used_is_refused(tmp_path: Path, change: Calla
         read_geometry(made.save_json(tmp_path / "a.json", document))
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{\n "type": "CityJSON",\n "vertices": [1 2]\n}', "line 3 column"),
+        ('{"type": "CityJSON"}\n{"type": "CityJSONFeature"}\n{"type"', "in line 3"),
+    ],
+)
+def test_the_line_where_json_is_damaged_is_said(tmp_path: Path, text: str, words: str):
+    with pytest.raises(SceneError, match=f"cut off or damaged .*{words}"):
+        read_geometry(save(tmp_path / "a.json", text))
+
+
 @pytest.mark.parametrize("swapped", [False, True])
 def test_swapped_axes_are_told_by_roofs_that_face_down(tmp_path: Path, caplog, swapped: bool):
     axes = [1, 0, 2] if swapped else [0, 1, 2]
@@ -177,9 +189,20 @@ def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog)
     file = made.ifc_house(unit=1.0)
     file.project.UnitsInContext = None
     with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
-        archive.write(file.save(tmp_path / "a.ifc"), "a.ifc")
+        archive.write(file.save(tmp_path / "a.ifc"), "folder/A.IFC")
+        archive.writestr("__MACOSX/folder/._A.IFC", "a fork")
     assert_cast_as(tmp_path / "a.ifczip", made.ifc_house_faces())
     assert "names no unit of length" in caplog.text
+
+
+@pytest.mark.parametrize("names", [("a.ifcxml",), ("a.ifc", "b/B.IFC")])
+def test_a_zip_that_holds_another_number_of_models_is_refused(tmp_path: Path, names: Sequence[str]):
+    path = made.ifc_house().save(tmp_path / "a.ifc")
+    with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
+        for name in (*names, "__MACOSX/._a.ifc"):
+            archive.write(path, name)
+    with pytest.raises(SceneError, match=f"holds {len(names) - len(names) % 2} models in IFC: unpack it"):
+        read_geometry(tmp_path / "a.ifczip")
 
 
 # CityGML

@@ -43,13 +43,7 @@ def read_cityjson(path: Path) -> Geometry:
         SceneError: it is no CityJSON, of an unknown version, or nothing is seen of it.
         Exception: it is damaged; of any kind.
     """
-    text = path.read_text("utf-8-sig")
-    try:
-        documents = [json.loads(text)]
-    except json.JSONDecodeError:
-        documents = [json.loads(line) for line in text.splitlines() if line.strip()]
-        if len(documents) < 2:
-            raise
+    documents = _documents(path.read_text("utf-8-sig"))
     head = documents[0]
     if not isinstance(head, dict) or head.get("type") != "CityJSON":
         raise SceneError(f"the shell {path} is {_other_json(head)}")
@@ -64,6 +58,27 @@ def read_cityjson(path: Path) -> Geometry:
                 )
         objects += _Document(document, head, missing).objects()
     return outside(objects, path, missing)
+
+
+def _documents(text: str) -> list[Any]:
+    """The json that a text is, or those of its lines.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    try:
+        return [json.loads(text)]
+    except json.JSONDecodeError as error:
+        of_whole = error
+    documents = []
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            documents += [json.loads(line)] if line.strip() else []
+        except json.JSONDecodeError as error:
+            raise (ValueError(f"{error.msg} in line {number}") if documents else of_whole) from error
+    if not documents:
+        raise of_whole
+    return documents
 
 
 class _Document:

@@ -132,21 +132,22 @@ def _opened(path: Path, ifcopenshell: ModuleType) -> Any:
     ifcopenshell knows one edition of each schema, and refuses headers that break STEP's rules, as those with a mark of
     the byte order, or with single backslashes in a path of Windows: what begins with DATA is read under a new one.
     """
-    try:
-        return ifcopenshell.open(path)
-    except ifcopenshell.Error as error:
-        data = _unpacked(path)
-        named, begin = _SCHEMA.search(data), _DATA.search(data)
-        if not named or not begin:
-            raise
-        schema = named[1].decode("ascii", "replace").upper()
-        if not (edition := _EDITION.fullmatch(schema)):
-            raise SceneError(
-                f"the shell {path} is {schema}, which is not read: export it as IFC2X3, IFC4 or IFC4X3"
-            ) from error
-    known = "IFC4X3_ADD2" if edition[1] == "IFC4X3" else edition[1]
     with TemporaryDirectory() as folder:
-        copy = Path(folder, "model.ifc")
+        source = path if path.suffix.lower() == ".ifc" else _unzipped(path, folder)
+        try:
+            return ifcopenshell.open(source)
+        except ifcopenshell.Error as error:
+            data = source.read_bytes()
+            named, begin = _SCHEMA.search(data), _DATA.search(data)
+            if not named or not begin:
+                raise
+            schema = named[1].decode("ascii", "replace").upper()
+            if not (edition := _EDITION.fullmatch(schema)):
+                raise SceneError(
+                    f"the shell {path} is {schema}, which is not read: export it as IFC2X3, IFC4 or IFC4X3"
+                ) from error
+        known = "IFC4X3_ADD2" if edition[1] == "IFC4X3" else edition[1]
+        copy = Path(folder, "copy.ifc")
         copy.write_bytes(_HEADER % known.encode() + data[begin.start() :])
         ifcopenshell.get_log()
         try:
@@ -155,12 +156,20 @@ def _opened(path: Path, ifcopenshell: ModuleType) -> Any:
             raise ValueError(next(iter(_faults(ifcopenshell)), str(error))) from error
 
 
-def _unpacked(path: Path) -> bytes:
-    """The text of a model, of the first in a zip."""
-    if path.suffix.lower() == ".ifc":
-        return path.read_bytes()
+def _unzipped(path: Path, folder: str) -> Path:
+    """The model of a zip, unpacked into a folder.
+
+    Raises:
+        SceneError: there is none, or several.
+    """
     with ZipFile(path) as archive:
-        return archive.read(next(name for name in archive.namelist() if name.lower().endswith(".ifc")))
+        names = [name for name in archive.namelist() if name.lower().endswith(".ifc")]
+        names = [name for name in names if not Path(name).name.startswith("._")]  # as macOS adds them
+        if len(names) != 1:
+            raise SceneError(
+                f"the shell {path} holds {len(names)} models in IFC: unpack it, and give those of the building"
+            )
+        return Path(archive.extract(names[0], folder))
 
 
 def _faults(ifcopenshell: ModuleType) -> list[str]:
