@@ -501,6 +501,13 @@ def test_an_ifc_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable,
         read_geometry(path)
 
 
+def test_a_layer_of_air_is_no_glass(tmp_path: Path):
+    file = made.Ifc()
+    file.block("IfcRoof", (0, 0, 3), (6, 4, 3.1), glass=True)
+    file.model.by_type("IfcSurfaceStyleRendering")[0].Transparency = 1.0
+    assert (read_geometry(file.save(tmp_path / "a.ifc")).classes == SurfaceClass.ROOF).all()
+
+
 HEADERS = [
     (r"^", "\ufeff"),
     (r"FILE_NAME\('[^']*'", r"FILE_NAME('C:\\\\Temp\\\\house.ifc'"),

@@ -58,7 +58,10 @@ _UNSEEN = {
     "IfcGeographicElement": ("VEGETATION", "SOIL_BORING_POINT"),
 }
 _GLASS = 0.3
-"""Transparency from which a part of anything but a door is a window: the glazing of a curtain wall, for example."""
+"""Transparency from which a part of anything but a door is a window: the glazing of a curtain wall, for example.
+
+A layer of air is a solid without any colour, of a transparency of 1.
+"""
 
 
 _NO_SURFACE = {
@@ -276,7 +279,7 @@ def _is(product: Any, name: str) -> bool:
 def _with_glass(own: SurfaceClass | None, shape: Any, count: int) -> UInt8[np.ndarray, " F"]:
     """Classes of a shape's triangles: panes of whatever is no door are windows."""
     classes = np.full(count, own, np.uint8)
-    glass = np.array([material.transparency >= _GLASS for material in shape.materials], bool)
+    glass = np.array([_GLASS <= material.transparency < 1 for material in shape.materials], bool)
     styles = np.array(shape.material_ids, np.int64)
     if own != SurfaceClass.DOOR and len(styles) == count and len(glass):
         classes[(styles >= 0) & glass[styles]] = SurfaceClass.WINDOW
