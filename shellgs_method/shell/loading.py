@@ -29,7 +29,7 @@ from shellgs_method.shell.spacing import Sights, as_seen
 COMMENT = "comment shellgs "
 _SLOW = (".ifc", ".ifczip")
 """Suffixes of models whose solids are cut and triangulated, two seconds for each megabyte."""
-_READER = 6
+_READER = 7
 """Version of their reader: they are read again if it changes."""
 _FAR = 1e4
 """Times the median distance from the median vertex beyond which a vertex is not the building's, but at the origin of

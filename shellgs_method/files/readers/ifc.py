@@ -231,6 +231,9 @@ def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
     bodies = {each.id() for each in contexts if (each.ContextIdentifier, each.TargetView) == ("Body", "MODEL_VIEW")}
     with_body = [each for each in products if _contexts_of(each) & bodies]
     others = [each for each in products if not _contexts_of(each) & bodies and _identifiers(each) - _NO_SURFACE]
+    for shape in [each.Representation for each in others]:  # whose contexts do not tell these apart
+        kept = [each for each in shape.Representations if each.RepresentationIdentifier not in _NO_SURFACE]
+        shape.Representations = kept
     for some, used in ((with_body, bodies), (others, set())):
         settings = geom.settings()
         if used:
