@@ -144,6 +144,12 @@ def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
     assert "left out what is no outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
 
 
+@pytest.mark.parametrize("inside", ["CeilingSurface", "ClosureSurface"])
+def test_a_roof_is_read_where_what_is_not_seen_has_its_outline(tmp_path: Path, inside: str):
+    ceiling = [Face([face.rings[0][::-1]], inside) for face in house() if face.surface == "RoofSurface"]
+    assert_cast_as(made.save_json(tmp_path / "a.json", made.cityjson([*ceiling, *house()])), moved(house()))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

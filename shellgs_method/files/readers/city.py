@@ -93,7 +93,7 @@ class _Outside:
         self.polygons: list[Polygon] = []
         self.classes: list[SurfaceClass] = []
         self.left, self.levels = Counter[str](), Counter[float]()
-        self._known: set[bytes] = set()
+        self._known: dict[bytes, bool] = {}  # outlines, and whether they are seen
 
     def add(self, city_object: CityObject) -> float:
         """Add an object and its parts; returns its highest level of detail."""
@@ -118,10 +118,11 @@ class _Outside:
     def _add(self, polygon: Polygon, known_class: SurfaceClass | None) -> None:
         outline = np.round(polygon.rings[0], 4) + 0.0  # no -0
         key = outline[np.lexsort(outline.T)].tobytes()
-        if key in self._known:  # a solid may have the polygons of its surfaces again
-            return
-        self._known.add(key)
-        if polygon.surface in (*_INSIDE, _NOTHING):
+        seen = polygon.surface not in (*_INSIDE, _NOTHING)
+        if key in self._known and (self._known[key] or not seen or not polygon.surface):
+            return  # a solid may have the polygons of its surfaces again, and a ceiling those of the roof
+        self._known[key] = seen
+        if not seen:
             self.left[polygon.surface] += 1
             return
         self.polygons.append(polygon)
