@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -134,11 +135,19 @@ def _written_in(path: Path) -> str:
             return root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
         finally:
             file.close()
+    if suffix == ".ifczip":
+        with ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".ifc")]
+            return _named_in(b"".join(map(archive.read, names)), _IN_FILES[".ifc"])
     if (pattern := _IN_FILES.get(suffix)) is None:
         return ""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
-        found = pattern.search(contents)
-        return found[1].decode().replace("\\/", "/") if found else ""
+        return _named_in(contents, pattern)
+
+
+def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:
+    found = pattern.search(contents)
+    return found[1].decode().replace("\\/", "/") if found else ""
 
 
 def _of_las(header: LasHeader, path: Path) -> str:

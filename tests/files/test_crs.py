@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,11 @@ def write_e57(path: Path) -> None:
     file.close()
 
 
+def write_zip(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.ifc", "#9=IFCPROJECTEDCRS('EPSG:25832','UTM 32',$,$,$,$,$);")
+
+
 def write_text(text: str):
     return lambda path: path.write_text(text)
 
@@ -52,6 +58,7 @@ def write_text(text: str):
         ("a.e57", write_e57, UTM),
         ("a.ifc", write_text("#9=IFCPROJECTEDCRS('EPSG:25832','UTM 32',$,$,$,$,$);"), UTM),
         ("a.ifc", write_text("#9=IFCPROPERTYSINGLEVALUE('Name',$,IFCLABEL('EPSG:25832'),$);"), UTM),  # of 2x3
+        ("a.ifczip", write_zip, UTM),
         ("a.gml", write_text('<gml:Envelope srsName="urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::5783">'), "EPSG:5555"),
         (
             "a.json",
