@@ -134,6 +134,15 @@ def test_a_whole_is_not_read_beside_its_parts_of_more_detail(tmp_path: Path):
     assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
 
 
+@pytest.mark.parametrize("level", ["0", "0.1", "0.3"])
+def test_footprints_of_any_refinement_are_left_out(tmp_path: Path, caplog, level: str):
+    document = made.cityjson(house())
+    outline = {"type": "MultiSurface", "lod": level, "boundaries": [[[0, 1, 2]]]}
+    document["CityObjects"] |= {"b": {"type": "Building", "geometry": [outline]}}
+    assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
+    assert "1 footprint (LoD 0)" in caplog.text
+
+
 def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
     document = made.cityjson(house())
     tree = {"type": "MultiSurface", "lod": "3", "boundaries": [[[0, 1, 2]]]}

@@ -107,7 +107,7 @@ class _Outside:
             if not part.kind.endswith("Part"):
                 self.add(part)
         parts = max((self.add(part) for part in city_object.parts if part.kind.endswith("Part")), default=-1.0)
-        if top == 0 and city_object.kind != _TERRAIN:
+        if 0 <= top < 1 and city_object.kind != _TERRAIN:
             self.left["footprint (LoD 0)"] += 1
         elif top >= max(parts, 0):  # below that, it is its parts again, less exact
             self.levels[top] += 1
