@@ -26,7 +26,7 @@ _END = b"END-ISO-10303-21"
 _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
 _EDITION = re.compile(r"(IFC2X3|IFC4|IFC4X3)(_TC\d|_ADD\d|_FINAL)*")
 """Editions that differ in nothing that is read here; release candidates and IFC4X1 do."""
-_DATA = re.compile(rb"^\s*DATA\s*;", re.IGNORECASE | re.MULTILINE)
+_DATA = re.compile(rb"(?:^|;)\s*(DATA\s*;)", re.IGNORECASE | re.MULTILINE)
 _HEADER = b"""ISO-10303-21;
 HEADER;
 FILE_DESCRIPTION((''),'2;1');
@@ -151,7 +151,7 @@ def _opened(path: Path, ifcopenshell: ModuleType) -> Any:
                 ) from error
         known = "IFC4X3_ADD2" if edition[1] == "IFC4X3" else edition[1]
         copy = Path(folder, "copy.ifc")
-        copy.write_bytes(_HEADER % known.encode() + data[begin.start() :])
+        copy.write_bytes(_HEADER % known.encode() + data[begin.start(1) :])
         ifcopenshell.get_log()
         try:
             return ifcopenshell.open(copy)
