@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -407,6 +408,12 @@ def test_a_robot_without_bodies_a_free_one_first_or_actuators_is_refused(folder,
     (tmp_path / "ball.xml").write_text(robot)
     with pytest.raises(SceneError, match=r"ball\.xml: the first body of a robot needs a free joint, and"):
         make(folder, robot=tmp_path / "ball.xml")
+
+
+def test_a_pickled_environment_has_the_same_episodes(folder):
+    env = make(folder, pedestrians=1, obstacle=True)
+    copy = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(episode(env, 3), episode(copy, 3))
 
 
 @pytest.mark.parametrize("name", ["robot", "obstacle", "pedestrian_0"])

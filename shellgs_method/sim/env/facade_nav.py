@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
@@ -57,7 +58,7 @@ class CameraSettings:
     exposure: float = 0.0
 
 
-class FacadeNav(gymnasium.Env):
+class FacadeNav(gymnasium.Env, EzPickle):
     """Drive a robot to a goal before a facade.
 
     Action: each of the robot's actuators, from -1 to 1, scaled to its ``ctrlrange``; of the default robot these are the
@@ -103,6 +104,7 @@ class FacadeNav(gymnasium.Env):
         everywhere: bool = False,
         render_mode: str | None = None,
     ) -> None:
+        EzPickle.__init__(self, world, robot, depth, rgb, pedestrians, obstacle, distance, everywhere, render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise SceneError(f"render_mode {render_mode!r} cannot be: give 'rgb_array'; its images can be shown")
         if not isinstance(pedestrians, Integral) or pedestrians < 0:
