@@ -410,6 +410,74 @@ def test_a_robot_without_bodies_a_free_one_first_or_actuators_is_refused(folder,
         make(folder, robot=tmp_path / "ball.xml")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("<worldbody>", '<worldbody><geom name="floor" type="plane" size="0 0 1"/>', "a floor or another body"),
+        ("</worldbody>", '<body><freejoint/><geom size="0.1"/></body></worldbody>', "a floor or another body"),
+        ('mass="5"', 'mass="5" contype="2" conaffinity="2"', "nothing of the robot meets the ground"),
+        ('<camera name="camera"', "<camera", "no camera named camera"),
+        ("<worldbody>", '<worldbody><camera name="camera"/>', "camera named camera is fixed to the world"),
+    ],
+)
+def test_what_a_robot_brings_or_lacks_is_refused(folder, tmp_path, old, new, says):
+    text = ROBOT.replace('<camera name="camera"', "<camera") if "<worldbody><camera" in new else ROBOT
+    (tmp_path / "ball.xml").write_text(text.replace(old, new))
+    with pytest.raises(SceneError, match=says):
+        make(folder, robot=tmp_path / "ball.xml")
+
+
+@pytest.mark.parametrize(("own", "used"), [("0.0005", 0.0005), ("0.003", 0.02 / 7), ("0.1", 0.02)])
+def test_a_robot_moves_by_the_time_step_and_the_contacts_of_its_file(folder, tmp_path, own, used):
+    options = f'<option timestep="{own}" cone="elliptic" impratio="100"/><worldbody>'
+    (tmp_path / "ball.xml").write_text(ROBOT.replace("<worldbody>", options))
+    env = make(folder, robot=tmp_path / "ball.xml", depth=False)
+    env.reset(seed=0)
+    env.step(np.zeros(1))
+    assert env.data.time == pytest.approx(STEP)
+    option = env.model.opt
+    assert option.timestep == pytest.approx(used)
+    assert (option.cone, option.impratio) == (mujoco.mjtCone.mjCONE_ELLIPTIC, 100)
+
+
+def test_a_lidar_does_not_see_its_own_mast_in_the_group_of_what_moves(folder, tmp_path):
+    mast = '<geom type="cylinder" group="4" size="0.02 0.3" pos="0.1 0 0.5" mass="0.1"/><site'
+    (tmp_path / "ball.xml").write_text(ROBOT)
+    (tmp_path / "mast.xml").write_text(ROBOT.replace("<site", mast))
+    seen = [make(folder, robot=tmp_path / name).reset(seed=0)[0] for name in ("ball.xml", "mast.xml")]
+    np.testing.assert_array_equal(seen[0]["lidar"], seen[1]["lidar"])
+    np.testing.assert_array_equal(seen[0]["depth"], seen[1]["depth"])
+
+
+@pytest.mark.parametrize("ground", [LEVEL, uneven()])
+def test_a_robot_stands_on_the_ground_as_its_file_has_it_wherever_its_origin_is(collider, folder, tmp_path, ground):
+    out = write_folder(tmp_path / "sim", collider, ground=ground)
+    shutil.copy(folder / "frame.json", out)
+    foot = ROBOT.replace('type="sphere" size="0.3"', 'type="box" size="0.1 0.1 0.3"')
+    lying = foot.replace('pos="0 0 0.3"', 'pos="0 0 0" euler="90 0 0"')
+    (tmp_path / "box.xml").write_text(lying)
+    env = make(out, robot=tmp_path / "box.xml", depth=False)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 1.0})
+    turn = env.data.xmat[env._root].reshape(3, 3)
+    np.testing.assert_allclose(turn[:, 0], [np.cos(1), np.sin(1), 0], atol=1e-9)
+    np.testing.assert_allclose(turn[:, 2], [np.sin(1), -np.cos(1), 0], atol=1e-9)
+    assert min(env.data.contact.dist, default=0) >= -0.002
+    height = env.data.xpos[env._root, 2] - env.world.ground.at(env._place[None])[0]
+    assert 0.1 < height < 0.2
+
+
+def test_an_episode_that_becomes_unstable_is_truncated_where_it_was(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning
+    (tmp_path / "ball.xml").write_text(ROBOT)
+    env = make(folder, robot=tmp_path / "ball.xml", depth=False)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 0.0})
+    env.data.qvel[0] = 1e15
+    _, reward, terminated, truncated, info = env.step(np.zeros(1))
+    assert (reward, terminated, truncated, info["driven"]) == (0, False, True, 0)
+    env.reset(seed=0)
+    assert not env.step(np.zeros(1))[3]
+
+
 def test_a_pickled_environment_has_the_same_episodes(folder):
     env = make(folder, pedestrians=1, obstacle=True)
     copy = pickle.loads(pickle.dumps(env))

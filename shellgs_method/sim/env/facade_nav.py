@@ -20,7 +20,6 @@ from shellgs_method.sim.env.world import (
     COLLISION,
     MOVING,
     PREFIX,
-    TIMESTEP,
     World,
     mujoco,
     robot_geoms,
@@ -31,6 +30,10 @@ STEP = 0.2
 """Seconds between actions."""
 MOVES = 10
 """Moves of pedestrians between two actions; collisions are looked for after each, as what bounces off is soon away."""
+LIFTS, TOUCH = 50, 0.001
+"""Times that a robot is lifted out of the ground before an episode, and the depth in metres in which it may stay."""
+UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+"""Warnings of MuJoCo, after which it puts the robot where its file has it."""
 RANGE = 20.0
 """Range of lidar and depth in metres."""
 BEAMS = 36
@@ -71,7 +74,8 @@ class FacadeNav(gymnasium.Env, EzPickle):
     Reward: metres of progress along the shortest way, plus 10 at the goal, minus 0.5 for a step with a collision.
 
     An episode terminates within half a metre of the goal, and is truncated after 300 steps of 0.2 seconds, or once the
-    robot has left the grid of ways, which ends 10 m beyond the photographs' cameras. ``info`` has ``success``, ``spl``
+    robot has left the grid of ways, which ends 10 m beyond the photographs' cameras, or its motion has become unstable,
+    of which MuJoCo warns. ``info`` has ``success``, ``spl``
     (Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents": 0 without success, else the length of the
     shortest way over that driven, at most 1, and 1 for a start at the goal), ``collisions`` (steps with one),
     ``trusted`` (whether the camera is where its images are to be believed), ``shortest`` and ``driven`` in metres; the
@@ -79,8 +83,9 @@ class FacadeNav(gymnasium.Env, EzPickle):
 
     Args:
         world: folder that ``shellgs sim`` wrote.
-        robot: MJCF file of another robot: its first body has a free joint, its actuators a ctrlrange; the camera is the
-            one named ``camera``, and the lidar the site ``lidar``.
+        robot: MJCF file of another robot: one body with a free joint, without a floor, its actuators with a ctrlrange;
+            the camera is the one named ``camera``, and the lidar the site ``lidar``. Its time step and other options
+            are those of its file.
         depth: whether there is a depth image, of 32 x 18 pixels.
         rgb: the camera's settings; no image if None.
         pedestrians: number of people who walk about.
@@ -115,12 +120,15 @@ class FacadeNav(gymnasium.Env, EzPickle):
             raise SceneError(f"distance {distance} cannot be: give the smallest and the largest in metres, as (5, 15)")
         self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
         self.model = self.world.model
+        self._steps = int(np.ceil(STEP / MOVES / self.model.opt.timestep - 1e-6))  # of MuJoCo between two moves
+        self.model.opt.timestep = STEP / MOVES / self._steps
         self.data = mujoco.MjData(self.model)
         self.render_mode, self._rgb, self._depth = render_mode, rgb, depth
         self._root = root_of(self.model)
         joint = self.model.body_jntadr[self._root]
         self._qpos = self.model.jnt_qposadr[joint]
         self._lidar, self._camera = self._sensor("site", "lidar"), self._sensor("camera", "camera")
+        self._ground = self.model.geom("ground").id
         self._robot = np.isin(np.arange(self.model.ngeom), robot_geoms(self.model))
         self._foreign = np.isin(self.model.geom_group, (COLLISION, MOVING)) & ~self._robot
         self.course = Course(self.world, distance, obstacle, everywhere)
@@ -150,8 +158,7 @@ class FacadeNav(gymnasium.Env, EzPickle):
         self._episode = self.course.drawn(self.data, self.np_random, options)
         start, self.goal = self._episode.start, self._episode.goal
         heading = float(options.get("heading", self.np_random.uniform(-np.pi, np.pi)))
-        height = float(self.world.ground.at(start[None])[0]) + self.model.qpos0[self._qpos + 2] + 0.01
-        self.data.qpos[self._qpos : self._qpos + 7] = *start, height, np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+        self._stand(start, heading)
         stops = self._rgb.exposure if self._rgb else 0.0
         self._gain = 2 ** (stops * self.np_random.uniform(-1, 1))
         self._pedestrians.spread(self.data, self.np_random, self._episode)
@@ -177,9 +184,10 @@ class FacadeNav(gymnasium.Env, EzPickle):
         moved = self.data.mocap_pos - was
         for k in range(MOVES):
             self.data.mocap_pos[:] = was + (k + 1) / MOVES * moved
-            mujoco.mj_step(self.model, self.data, round(STEP / MOVES / TIMESTEP))
+            mujoco.mj_step(self.model, self.data, self._steps)
             collides |= self._collides()
-        now = self._place
+        unstable = any(self.data.warning[kind].number for kind in UNSTABLE)
+        now, collides = (self._was, False) if unstable else (self._place, collides)
         self._driven += float(np.linalg.norm(now - self._was))
         self._was = now
         self._collisions += collides
@@ -189,7 +197,7 @@ class FacadeNav(gymnasium.Env, EzPickle):
         success = bool(np.linalg.norm(self.goal - now) < NEAR)
         reward = progress + SUCCESS * success - COLLISION_COST * collides
         outside = not self.course.space.has(now)  # ways are not known there, and ground that is not level soon ends
-        return self._observed(), reward, success, outside, self._info(success)
+        return self._observed(), reward, success, outside or unstable, self._info(success)
 
     def render(self):
         """The robot's camera image by the splats."""
@@ -198,6 +206,23 @@ class FacadeNav(gymnasium.Env, EzPickle):
         rgb = self._rgb or CameraSettings()
         camera = camera_of(self.model, self.data, self._camera, rgb.width, rgb.height)
         return as_bytes(self._images.image(self.model, self.data, camera, self._gain))
+
+    def _stand(self, place: Float64[np.ndarray, " 2"], heading: float) -> None:
+        """Put the robot on the ground, leaning as its file has it, with its x along a heading in radians."""
+        of_root, turn = slice(self._qpos, self._qpos + 7), np.zeros(9)
+        pose, own = self.data.qpos[of_root], self.model.qpos0[of_root]
+        mujoco.mju_quat2Mat(turn, own[3:])
+        half = (heading - np.arctan2(turn[3], turn[0])) / 2
+        mujoco.mju_mulQuat(pose[3:], np.array([np.cos(half), 0, 0, np.sin(half)]), own[3:])
+        pose[:2] = place
+        pose[2] = self.world.ground.at(place[None])[0] + own[2] + 0.01
+        for _ in range(LIFTS):
+            mujoco.mj_forward(self.model, self.data)
+            pairs, depths = self.data.contact.geom, -self.data.contact.dist
+            below = (pairs == self._ground).any(axis=1) & self._robot[pairs].any(axis=1)
+            if depths[below].max(initial=0) <= TOUCH:
+                return
+            pose[2] += depths[below].max()
 
     @property
     def _place(self) -> Float64[np.ndarray, " 2"]:
@@ -210,9 +235,12 @@ class FacadeNav(gymnasium.Env, EzPickle):
             SceneError: it has none of this name.
         """
         try:
-            return int(getattr(self.model, kind)(PREFIX + name).id)
+            sensor = getattr(self.model, kind)(PREFIX + name)
         except KeyError as error:
             raise SceneError(f"the robot has no {kind} named {name}: add it to its MJCF file") from error
+        if self.model.body_rootid[sensor.bodyid[0]] != self._root:
+            raise SceneError(f"the robot's {kind} named {name} is fixed to the world: put it into its first body")
+        return int(sensor.id)
 
     def _collides(self) -> bool:
         """Whether the robot touches anything but itself and the ground."""

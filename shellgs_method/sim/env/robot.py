@@ -2,6 +2,7 @@
 
 DEFAULT_ROBOT = """
 <mujoco model="base">
+  <option timestep="0.004"/>
   <default>
     <default class="foot">
       <geom type="sphere" size="0.1" mass="1" condim="1" priority="1" friction="0 0 0"/>

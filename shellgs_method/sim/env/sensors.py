@@ -13,12 +13,10 @@ from torch import Tensor
 from shellgs_method.files.splats import Splats, read_splats
 from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.render.view import ViewRenderer
-from shellgs_method.sim.env.world import MOVING, World, mujoco
+from shellgs_method.sim.env.world import HIDDEN, MOVING, World, mujoco
 
 DRAWN = (0, 1, 2, MOVING)
 """Groups of geoms in the camera's image: those that MuJoCo draws, and what moves."""
-HIDDEN = 5
-"""A group that is in no image."""
 STATIC = 0
 """Rays pass geoms that are fixed to the world: of the groups that are drawn, they meet the robot alone."""
 SKY = 0.7, 0.8, 0.9

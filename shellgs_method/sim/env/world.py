@@ -23,10 +23,8 @@ from shellgs_method.sim.workspace import Workspace
 
 mujoco = import_mujoco()
 
-TIMESTEP = 0.004
-"""Time step of the physics in seconds."""
-COLLISION, MOVING = 3, 4
-"""Groups of geoms: the buildings' convex parts, and what moves."""
+COLLISION, MOVING, HIDDEN = 3, 4, 5
+"""Groups of geoms: the buildings' convex parts, what moves, and what is in no image and in no beam."""
 PERSON, HALF_HEIGHT = 0.25, 0.6
 """Radius of a pedestrian's capsule, and half the length of its axis, in metres."""
 BOX = 0.6
@@ -63,11 +61,11 @@ class World:
 
     @classmethod
     def load(cls, folder: Path, robot: Path | None = None, pedestrians: int = 0, obstacle: bool = False) -> World:
-        """Read a folder and put a robot into it.
+        """Read a folder and put a robot into it, which moves by the time step and the other options of its own file.
 
         Args:
             folder: what ``shellgs sim`` wrote.
-            robot: MJCF file of a robot, whose first body has a free joint; the default robot if None.
+            robot: MJCF file of a robot, one body with a free joint; the default robot if None.
             pedestrians: number of capsules.
             obstacle: whether there is a box to drive around.
 
@@ -79,14 +77,21 @@ class World:
         facts = read_json(folder / FRAME)
         workspace = Workspace.read(facts, folder / FRAME)
         spec = read_spec(folder / "world.xml")
-        spec.option.timestep = TIMESTEP
         whose = robot or "the default robot"
         given = mujoco.MjSpec.from_string(DEFAULT_ROBOT) if robot is None else read_spec(robot)
         first = given.worldbody.first_body()
         joints = [joint.type for joint in first.joints] if first else []
         if joints != [mujoco.mjtJoint.mjJNT_FREE] or not given.actuators:
             raise SceneError(f"{whose}: the first body of a robot needs a free joint, and the robot actuators")
+        if len(given.worldbody.bodies) > 1 or given.worldbody.geoms:
+            raise SceneError(
+                f"{whose}: beside the robot there is a floor or another body, which would stay where it is: give the "
+                "file of the robot alone"
+            )
         first.name = first.name or "first"  # as it is found by its name
+        spec.option = given.option
+        if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:  # MuJoCo's default, no faster and less stable
+            spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.attach(given, prefix=PREFIX, frame=spec.worldbody.add_frame())
         capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [PERSON, HALF_HEIGHT, 0], "rgba": [0.2, 0.3, 0.7, 1]}
         box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [BOX, BOX, 1], "rgba": [0.7, 0.6, 0.4, 1]}
@@ -97,6 +102,9 @@ class World:
         model = compiled(spec, folder / "world.xml")
         if not (model.actuator_ctrllimited.astype(bool) & (np.ptp(model.actuator_ctrlrange, axis=1) > 0)).all():
             raise SceneError(f"{whose}: each actuator needs a ctrlrange, which actions of -1 to 1 are scaled to")
+        if not _solid_geoms(model):
+            raise SceneError(f"{whose}: nothing of the robot meets the ground: give a geom contype or conaffinity 1")
+        model.geom_group[[k for k in robot_geoms(model) if model.geom_group[k] == MOVING]] = HIDDEN
         parts = _parts(model)
         ground = _ground(model).under(np.concatenate([*parts, workspace.eyes]))
         grid = FreeSpace.of(parts, ground, workspace.eyes[:, :2])
@@ -126,12 +134,17 @@ def robot_geoms(model) -> np.ndarray:
     return np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)
 
 
+def _solid_geoms(model) -> list[int]:
+    """Numbers of the robot's geoms that the ground and buildings stop, which are of MuJoCo's first kind."""
+    return [k for k in robot_geoms(model) if (model.geom_contype[k] | model.geom_conaffinity[k]) & 1]
+
+
 def _radius(model) -> float:
     """Largest horizontal distance of the robot's collision geometry from its base, as it stands at first."""
     root = root_of(model)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    solid = [k for k in robot_geoms(model) if model.geom_contype[k] or model.geom_conaffinity[k]]
+    solid = _solid_geoms(model)
     off = np.linalg.norm((data.geom_xpos[solid] - data.xpos[root])[:, :2], axis=1)
     return float((off + _reach(model, solid)).max())
 

@@ -44,6 +44,7 @@ A building's folder can be copied anywhere, and has no ground, light or physics 
 import mujoco
 world = mujoco.MjSpec.from_file("world.xml")
 robot = mujoco.MjSpec.from_file("…/unitree_go2/go2.xml")
+world.option = robot.option   # time step, cone, impratio, …, which attach leaves out
 world.attach(robot, prefix="go2/", frame=world.worldbody.add_frame(pos=[0, 0, 0.1]))
 model = world.compile()
 ```
