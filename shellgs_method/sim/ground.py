@@ -1,4 +1,4 @@
-"""The ground in front of a building: a height field where it is known, a plane where it is not."""
+"""The ground in front of a building: a height field, which goes on to a plane where nothing near is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import distance_transform_edt, median_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 from scipy.optimize import least_squares
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -32,7 +32,9 @@ STEP = 0.25
 GAP = 0.3
 """Distance in metres from what is known up to which the ground between is taken for known."""
 FADE = 1.0
-"""Distance in metres over which the ground passes into the plane where it is not known."""
+"""Distance in metres over which the ground passes into that of what is around where it is not known."""
+REACHES = 16.0, 8.0, 4.0, 2.0, 1.0
+"""Distances in metres over which heights are averaged for that of what is around, of which an eighth must be known."""
 NEAR = 0.1
 """Distance from the ground in metres up to which a triangle may be of it."""
 FLAT = 0.8
@@ -65,7 +67,7 @@ class Ground:
         heights: in metres; rows along y, columns along x.
         cell: distance between rows and between columns, in metres.
         origin: x and y of the first row and column.
-        known: where the heights are measured; elsewhere they pass into a plane.
+        known: where the heights are measured; elsewhere they go on as beside, and far away as a plane.
     """
 
     heights: Float64[np.ndarray, "R C"]
@@ -107,7 +109,8 @@ class Ground:
         area = self.known.sum() * self.cell**2
         return (
             f"The ground is a height field, measured on {area:.0f} m² "
-            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point); elsewhere it is a plane."
+            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point); elsewhere it goes on as "
+            "beside that."
         )
 
     @property
@@ -195,7 +198,7 @@ class _Street:
 
     Attributes:
         measured: heights; NaN where there are none.
-        level: heights of the plane that it passes into.
+        level: heights of the plane that it passes into far away.
         cell: side of a cell in metres.
     """
 
@@ -242,9 +245,16 @@ class _Street:
 
     @property
     def everywhere(self) -> Float64[np.ndarray, "R C"]:
-        """Heights, which pass into those of the plane where none is measured."""
-        smooth = median_filter(self.nearest - self.level, size=3)
-        return self.level + smooth * np.exp(-np.maximum(self.gap - GAP, 0) / FADE)
+        """Heights, which pass into those around where none is measured, as below a car, and far away into the plane."""
+        smooth, known = median_filter(self.nearest - self.level, size=3), np.isfinite(self.measured)
+        around = np.zeros_like(smooth)
+        for reach in REACHES:
+            weight, total = (
+                gaussian_filter(each, reach / self.cell, mode="constant") for each in (known * 1.0, known * smooth)
+            )
+            share = np.minimum(1, 8 * weight)
+            around += share * (total / np.maximum(weight, 1e-9) - around)
+        return self.level + around + (smooth - around) * np.exp(-np.maximum(self.gap - GAP, 0) / FADE)
 
 
 def _streets(points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], grid: _Grid) -> Iterator[_Street]:

@@ -68,6 +68,19 @@ def test_what_stands_on_the_ground_is_not_ground(ground):
     assert ground.at(np.array([-2.0, -6.2])) == pytest.approx(street(np.array(-2.0), np.array(-6.2)), abs=0.02)
 
 
+def test_the_ground_goes_on_below_cars_and_beside_a_street_that_is_no_plane():
+    """One that is level, and then rises by 8 %: its plane is a metre off, at the bend and at the ends."""
+    x, y = np.random.default_rng(0).uniform((-30, -6), (30, 6), (60_000, 2)).T
+    cars = (np.abs(y - 4) < 1) & (x % 12 < 4.5)
+    points = np.stack([x, y, 0.08 * np.maximum(x, 0)], axis=1)[~cars]
+    eyes = np.array([[at, 0, 0.08 * max(at, 0) + 1.6] for at in range(-30, 31, 4)])
+    made = Ground.of(points, eyes)
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(-28, 28, 200), np.linspace(-8, 8, 60)))
+    off = np.abs(made.at(np.stack([x, y], axis=1)) - 0.08 * np.maximum(x, 0))
+    assert off[np.abs(y) < 6].max() < 0.1
+    assert off.max() < 0.2
+
+
 def test_the_ground_is_a_plane_where_nothing_is_known(ground):
     rows, columns = np.indices(ground.heights.shape)
     x, y = ground.origin[0] + ground.cell * columns, ground.origin[1] + ground.cell * rows
@@ -76,7 +89,7 @@ def test_the_ground_is_a_plane_where_nothing_is_known(ground):
     assert not ground.known[far].any()
     design = np.stack([x[far], y[far], np.ones(far.sum())], axis=1)
     plane, *_ = np.linalg.lstsq(design, ground.heights[far], rcond=None)
-    assert np.abs(design @ plane - ground.heights[far]).max() < 0.01
+    assert np.abs(design @ plane - ground.heights[far]).max() < 0.02
     assert plane[0] == pytest.approx(-0.03, abs=0.01)
 
 
