@@ -136,6 +136,7 @@ def test_a_lidar_in_pybullet_agrees_with_ray_casting(street, collider, lidar_ray
         body = bullet.loadURDF(str(world / "world.urdf"), useFixedBase=True)
         links = [bullet.getCollisionShapeData(body, link) for link in range(bullet.getNumJoints(body))]
         assert sorted(map(len, links)) == [1, len(collider.parts)]
+        assert {bullet.getDynamicsInfo(body, link)[1] for link in range(len(links))} == {FRICTION}
         hits = bullet.rayTestBatch(origins.tolist(), (origins + 90 * rays).tolist())
         bullet.resetSimulation()
         alone = bullet.loadURDF(str(world / "facade" / "facade.urdf"), useFixedBase=True)

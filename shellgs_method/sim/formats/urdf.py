@@ -83,6 +83,7 @@ def _fixed(root: ET.Element, name: str) -> ET.Element:
     joint = add(root, "joint", name=f"world_{name}", type="fixed")
     add(joint, "parent", link="world")
     add(joint, "child", link=name)
+    add(add(link, "contact"), "lateral_friction", value=FRICTION)  # PyBullet's own; its default is 0.5
     friction = add(root, "gazebo", reference=name)  # sdformat's parser reads it, that of ROS passes over it
     add(friction, "mu1", FRICTION)
     add(friction, "mu2", FRICTION)
