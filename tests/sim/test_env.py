@@ -429,7 +429,8 @@ def test_what_a_robot_brings_or_lacks_is_refused(folder, tmp_path, old, new, say
 
 @pytest.mark.parametrize(("own", "used"), [("0.0005", 0.0005), ("0.003", 0.02 / 7), ("0.1", 0.02)])
 def test_a_robot_moves_by_the_time_step_and_the_contacts_of_its_file(folder, tmp_path, own, used):
-    options = f'<option timestep="{own}" cone="elliptic" impratio="100"/><worldbody>'
+    flags = '<flag contact="disable" constraint="disable"/>'  # of a robot that was alone
+    options = f'<option timestep="{own}" cone="elliptic" impratio="100">{flags}</option><worldbody>'
     (tmp_path / "ball.xml").write_text(ROBOT.replace("<worldbody>", options))
     env = make(folder, robot=tmp_path / "ball.xml", depth=False)
     env.reset(seed=0)
@@ -438,6 +439,7 @@ def test_a_robot_moves_by_the_time_step_and_the_contacts_of_its_file(folder, tmp
     option = env.model.opt
     assert option.timestep == pytest.approx(used)
     assert (option.cone, option.impratio) == (mujoco.mjtCone.mjCONE_ELLIPTIC, 100)
+    assert env.data.xpos[env._root, 2] == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_lidar_does_not_see_its_own_mast_in_the_group_of_what_moves(folder, tmp_path):

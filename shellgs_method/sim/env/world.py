@@ -90,6 +90,7 @@ class World:
             )
         first.name = first.name or "first"  # as it is found by its name
         spec.option = given.option
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:  # MuJoCo's default, no faster and less stable
             spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.attach(given, prefix=PREFIX, frame=spec.worldbody.add_frame())
