@@ -290,6 +290,17 @@ def test_a_pedestrian_before_the_camera_hides_the_splats_and_noise_is_the_seeds(
     assert image[12:, 15:17, 2].mean() > image[12:, 15:17, 0].mean() + 0.2  # blue
 
 
+def test_lidar_and_depth_see_who_stands_ahead(folder):
+    """With MuJoCo before 3.12, which is refused, rays pass bodies that are moved from outside."""
+    env = make(folder, pedestrians=1)
+    env.reset(seed=3, options={"start": (4, -6), "goal": (9, -6), "heading": 0.0})
+    env.world.put(env.data, "pedestrian_0", np.array([6.0, -6.0]), 0.85)
+    mujoco.mj_forward(env.model, env.data)  # pyright: ignore[reportAttributeAccessIssue]
+    seen = env._observed()
+    assert seen["lidar"][0] == pytest.approx(2 - PERSON, abs=0.01)
+    assert seen["depth"][10:, 15:17].min() == pytest.approx(2 - PERSON, abs=0.01)
+
+
 THIRD_PERSON = """
 <mujoco model="seen">
   <asset><material name="paint" rgba="1 0 0 1"/></asset>
