@@ -27,8 +27,9 @@ BEYOND = 20.0
 """Width of the ground around the cameras and what is known of it, in metres."""
 BAND = 1.0
 """Height in metres by which the ground may leave a plane, or what is already found of it beside it, as on stairs."""
-STEP = 0.25
-"""Largest step between neighbouring cells, in metres: stairs have 20 cm, and the tops of walls and cars are higher."""
+STEP, STEEP = 0.25, 0.2
+"""Largest step between neighbouring cells, in metres: stairs have 20 cm, and the tops of walls and cars are higher. Of
+larger cells it is this slope: a street of 15 % rises as much from one to the next."""
 GAP = 0.3
 """Distance in metres from what is known up to which the ground between is taken for known."""
 FADE = 1.0
@@ -215,7 +216,8 @@ class _Street:
         near = below & (np.abs(points[:, 2] - level.ravel()[index]) < BAND)
         while near.any():
             heights = grid.lowest(points[near])
-            heights[~_joined(heights - level, max(round(GAP / grid.cell), 1))] = np.nan
+            step = max(STEP, STEEP * grid.cell)
+            heights[~_joined(heights - level, max(round(GAP / grid.cell), 1), step)] = np.nan
             longer = cls(heights, level, grid.cell)
             if longer.area <= street.area:
                 return street
@@ -299,8 +301,8 @@ def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
     return np.array([slope[0], slope[1], middle[2] + slope[2] - slope[:2] @ middle[:2]])
 
 
-def _joined(heights: Float64[np.ndarray, "R C"], reach: int) -> Bool[np.ndarray, "R C"]:
-    """The largest group of cells with heights that are joined by small steps, at most ``reach`` cells apart."""
+def _joined(heights: Float64[np.ndarray, "R C"], reach: int, high: float) -> Bool[np.ndarray, "R C"]:
+    """The largest group of cells that are joined by steps below ``high`` metres, at most ``reach`` cells apart."""
     number = np.arange(heights.size).reshape(heights.shape)
     pairs = []
     for step in range(1, reach + 1):
@@ -308,7 +310,7 @@ def _joined(heights: Float64[np.ndarray, "R C"], reach: int) -> Bool[np.ndarray,
             ((slice(None), slice(None, -step)), (slice(None), slice(step, None))),
             ((slice(None, -step), slice(None)), (slice(step, None), slice(None))),
         ):
-            joined = np.abs(heights[one] - heights[other]) < STEP
+            joined = np.abs(heights[one] - heights[other]) < high
             pairs.append(np.stack([number[one][joined], number[other][joined]]))
     rows, columns = np.concatenate(pairs, axis=1)
     graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(heights.size, heights.size))

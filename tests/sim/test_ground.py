@@ -81,6 +81,17 @@ def test_the_ground_goes_on_below_cars_and_beside_a_street_that_is_no_plane():
     assert off.max() < 0.2
 
 
+def test_a_hill_is_one_street_in_the_large_cells_of_a_large_site(monkeypatch):
+    """From one cell of 4.6 m to the next its slope of up to 12 % is higher than a stair."""
+    monkeypatch.setattr("shellgs_method.sim.ground.CELLS", 600)
+    x, y = np.random.default_rng(0).uniform((-100, -6), (100, 6), (40_000, 2)).T
+    along = np.arange(-100, 101, 4.0)
+    eyes = np.stack([along, 0 * along, 1.6 - 6e-4 * along**2], axis=1)
+    made = Ground.of(np.stack([x, y, -6e-4 * x**2], axis=1), eyes)
+    assert made.cell > 4
+    assert made.at(eyes) == pytest.approx(eyes[:, 2] - 1.6, abs=0.3)
+
+
 def test_the_ground_is_a_plane_where_nothing_is_known(ground):
     rows, columns = np.indices(ground.heights.shape)
     x, y = ground.origin[0] + ground.cell * columns, ground.origin[1] + ground.cell * rows
