@@ -1,4 +1,4 @@
-"""The simulation frame: metres, z up, the origin on the ground in front of the facade."""
+"""The simulation frame: metres, z up, the origin in front of the facade, at the height of its lower edge."""
 
 from __future__ import annotations
 

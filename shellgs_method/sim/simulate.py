@@ -147,7 +147,7 @@ def _world(
     FreeSpace.of(parts, ground, paths).write(out, paths)
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
     metrics = write_report(out, chapters, ground, settings.test, log)
-    write_readme(out, assets, home, metrics)
+    write_readme(out, assets, home, ground, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from worlds import compliance_errors, frame_at
+from worlds import compliance_errors, frame_at, uneven
 
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import MOST_GROUND, ground_step
+from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.formats.ground import MESH
+from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground
 from shellgs_method.sim.trials.engine import lidar
@@ -158,6 +160,15 @@ def folder(ground, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("street")
     write_world(out, [], frame_at(), ground)
     return out
+
+
+def test_a_robot_stands_on_the_ground_of_a_slope_by_the_lines_of_the_readme(tmp_path):
+    """The origin is at the height of the shell's lower edge, which is at the foot of the slope."""
+    write_readme(tmp_path, [Asset("facade", 1)], frame_at(), uneven(), {"summary": []})
+    text = (tmp_path / "README.md").read_text()
+    height = uneven().at(np.zeros((1, 2)))[0]
+    assert f"a height of {height:.2f}." in text
+    assert f"add_frame(pos=[0, 0, {height + 0.1:.2f}])" in text
 
 
 PLACES = np.random.default_rng(2).uniform([-7, -7.5], [7, -0.4], (300, 2))

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.frame import SimFrame
+from shellgs_method.sim.ground import Ground
 
 _TEXT = """# {title}
 
-{frame} z points up, from the foot of the facade. `frame.json` has the matrices to the
+{frame} z points up, from the foot of the facade; the
+ground at the origin has a height of {height:.2f}. `frame.json` has the matrices to the
 scene's cameras (`to_scene`) and to national coordinates (`to_national`). Coordinates and `offset` add up to those of
 the shell with z up, in metres, as in the json of `shellgs mesh`.
 
@@ -45,7 +49,7 @@ import mujoco
 world = mujoco.MjSpec.from_file("world.xml")
 robot = mujoco.MjSpec.from_file("…/unitree_go2/go2.xml")
 world.option = robot.option   # time step, cone, impratio, …, which attach leaves out
-world.attach(robot, prefix="go2/", frame=world.worldbody.add_frame(pos=[0, 0, 0.1]))
+world.attach(robot, prefix="go2/", frame=world.worldbody.add_frame(pos=[0, 0, {above:.2f}]))
 model = world.compile()
 ```
 
@@ -91,16 +95,19 @@ In ROS, a building's folder is a package of its name: copy it into a workspace's
 """
 
 
-def write_readme(out: Path, assets: Sequence[Asset], frame: SimFrame, metrics: dict) -> None:
+def write_readme(out: Path, assets: Sequence[Asset], frame: SimFrame, ground: Ground, metrics: dict) -> None:
     """Write a README with the folder's contents and how each simulator loads it."""
+    height = round(float(ground.at(np.zeros((1, 2)))[0]), 2) + 0.0  # not -0.00
     where = (
-        "Coordinates are metres along the shell's axes; the origin is on the ground in front of the facade."
+        "Coordinates are metres along the shell's axes; the origin is in front of the facade."
         if frame.metric
         else "The scene has no aligned shell: the unit of length is unknown, and the files state the metre."
     )
     text = _TEXT.format(
         title=", ".join(asset.name for asset in assets),
         frame=where,
+        height=height,
+        above=height + 0.1,
         plural="s" if len(assets) > 1 else "",
         assets="\n".join(f"| `{asset.name}/` | a building of {asset.parts} convex parts |" for asset in assets),
         first=assets[0].name,
