@@ -287,8 +287,8 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
         models = []
         if is_global:
             options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
-            mapped = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options)
-            models = [_placed(model) for model in mapped.values()]
+            mapped = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options).values()
+            models = [model for model in map(_placed, mapped) if model.num_reg_images()]
         if fitting(models) < (count, CONFIRMED):
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
             options.constant_cameras, options.constant_rigs = known, rigs
@@ -316,11 +316,15 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
 
 
 def _placed(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A model without the photographs that show hardly a point of it, which global mapping leaves anywhere."""
-    for number in list(model.reg_frame_ids()):
-        images = [model.image(data.id) for data in model.frame(number).image_ids]
-        if sum(image.num_points3D for image in images) < _LEAST_POINTS:
-            model.deregister_frame(number)
+    """A model without the photographs that show hardly a point of it, or have an absurd lens.
+
+    Global mapping leaves them anywhere; incremental mapping leaves them out by itself.
+    """
+    manager, limits = pycolmap.ObservationManager(model), pycolmap.IncrementalMapperOptions()
+    focal = limits.min_focal_length_ratio, limits.max_focal_length_ratio
+    for frame in manager.filter_frames(*focal, np.inf, _LEAST_POINTS):  # distortion of a long lens may be any number
+        manager.deregister_frame(frame)
+    model.tear_down()  # their cameras, too
     return model
 
 

@@ -1377,6 +1377,40 @@ def test_an_absurd_focal_length_of_exif_is_forgotten(tmp_path, said, known):
     assert 0.5 < np.frombuffer(params)[0] / 200 < 1.0
 
 
+_UNFOUNDED = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import sfm  # first: it imports what must come before pycolmap
+import pycolmap
+
+folder = sys.argv[2]
+options = pycolmap.SyntheticDatasetOptions(num_rigs=3, num_frames_per_rig=3, num_points2D_without_point3D=0)
+with pycolmap.Database.open(folder + "/database.db") as opened:
+    model = pycolmap.synthesize_dataset(options, opened)
+few, enough, *_, absurd = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+for image, points in ((few, 9), (enough, 10)):
+    for k in range(100 - points):
+        model.delete_observation(image.image_id, k)
+lens = model.camera(absurd.camera_id)  # which two others share
+lens.params = [-43304, *lens.params[1:]]
+pycolmap.global_mapping = lambda *_: {0: model}
+pycolmap.incremental_mapping = lambda *_, **__: {}
+(found,) = sfm.reconstruct(folder + "/database.db", folder, folder, has_parallax=True)
+read = pycolmap.Reconstruction(folder)
+print(json.dumps([found["names"], sorted(image.name for image in read.images.values()), sorted(read.cameras)]))
+"""
+
+
+def test_photographs_that_global_mapping_places_by_nothing_are_not_registered(tmp_path):
+    """It keeps all that it began with: tourists' photographs had one of no points and of a negative focal length."""
+    command = [sys.executable, "-c", _UNFOUNDED, Path(stages.__file__).parent, tmp_path]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    names, written, cameras = json.loads(printed.splitlines()[-1])
+    wanted = [(1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]
+    assert names == written == [f"camera{camera:06d}_frame{frame:06d}.png" for camera, frame in wanted]
+    assert cameras == [1, 2]
+
+
 def test_photographs_of_one_name_in_two_formats_keep_their_own_masks(tmp_path):
     names = ("a.jpg", "a.png", "b.jpg")
     for folder in ("photographs", "masks", "model", "scene"):
