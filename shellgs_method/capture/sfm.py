@@ -310,6 +310,7 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
             "track_length": model.compute_mean_track_length(),
             "torn": weakest(model).between if weakest(model).confirmed < CONFIRMED else None,
             "zoomed": _zoomed(model) if is_alone and model is ranked[0] else None,
+            "lenses": _shared_lenses(model),
         }
         for model in ranked
     ]
@@ -402,6 +403,19 @@ def _adjusted(
     freedom = 2 * copy.compute_num_observations() - 3 * len(points) - 6 * len(images) - copy.num_cameras()
     cost = summary.ceres_summary.final_cost  # pyright: ignore[reportAttributeAccessIssue]  Ceres is the default
     return cost, focal, freedom
+
+
+def _shared_lenses(model: pycolmap.Reconstruction) -> list[dict]:
+    """Names of the photographs of each lens that several have, and the focal lengths found, across and down."""
+    names: dict[int, list[str]] = {}
+    for image in _registered(model):
+        names.setdefault(image.camera_id, []).append(image.name)
+    found = [(model.camera(number), several) for number, several in names.items() if len(several) > 1]
+    return [
+        {"names": several, "focal": [camera.focal_length_x, camera.focal_length_y]}
+        for camera, several in found
+        if camera.model.name != _CALIBRATED
+    ]
 
 
 class _Weakest(NamedTuple):

@@ -38,6 +38,7 @@ from shellgs_method.capture.photographs import (
     add_photograph,
     find_masks,
     find_photographs,
+    focal_length_of_exif,
     group_by_lens,
     keep_exposure,
     masks_as_stored,
@@ -61,6 +62,9 @@ LEAST_SEEN = 30
 _HOMOGRAPHIES = (4, 5, 6)  # COLMAP's PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 _MATCHED = 100  # features, of a pair that shows the same: of others they were 31 at most
 _NO_PARALLAX = 0.95  # share of such pairs: all of a camera on a tripod, a sixth of a walk along the synthetic facade
+
+_OFF_EXIF = 1.2  # factor; EXIF's, of the diagonal or the width and rounded, was up to 10 % off that of right models
+_OFF_SQUARE = 1.03  # factor; of right models two focal lengths differed by 0.5 % at most
 
 _SIFT = {
     "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
@@ -414,6 +418,7 @@ class _Capture:
                 f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
                 f"{slower}."
             )
+        lenses = largest.pop("lenses", [])
         if zoomed := largest.pop("zoomed", None):
             change, short, long = zoomed
             notice(
@@ -422,11 +427,27 @@ class _Capture:
                 "does. Cameras may be metres off. Record without these; photographs of two lenses go into a folder "
                 "each, with --cameras folder."
             )
+        else:
+            for lens in lenses:
+                self._tell_of_a_doubtful_lens(sorted(lens["names"], key=along_the_walk), *lens["focal"])
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:
                 only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
                 self._tell_of_a_pass_apart(only, found.get("apart", []))
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
+
+    def _tell_of_a_doubtful_lens(self, names: list[str], across: float, down: float) -> None:
+        """Tell of a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
+        exif = focal_length_of_exif(self.folder / names[0])
+        is_other = exif is not None and not 1 / _OFF_EXIF < (across + down) / 2 / exif < _OFF_EXIF
+        if is_other or max(across, down) > _OFF_SQUARE * min(across, down):
+            said = f", in EXIF {exif:.0f}" if exif else ""
+            notice(
+                f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} "
+                f"pixels across and {down:.0f} down were found{said}. If they were not cropped, stretched or "
+                "stabilised, they do not tell it, as where all look straight at one plane, or ahead along a street, "
+                "and depths are off by as much: take some from the side, at angles to the wall."
+            )
 
     def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
         if not names:

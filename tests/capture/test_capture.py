@@ -1228,6 +1228,43 @@ def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
     assert "seems to change by 30%, between 4.jpg and 5.jpg" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("film", "found", "told"),
+    [
+        (26, [48, 48], ""),
+        (26, [41, 41], ""),
+        (26, [39, 39], "39 pixels across and 39 down were found, in EXIF 48."),
+        (26, [58, 58], "58 pixels across and 58 down were found, in EXIF 48."),
+        (None, [58, 58], ""),
+        (0, [58, 58], ""),
+        (None, [100, 102], ""),
+        (None, [100, 104], "100 pixels across and 104 down were found."),
+    ],
+)
+def test_a_focal_length_that_no_such_camera_has_is_told(tmp_path, monkeypatch, caplog, film, found, told):
+    """Along a street pixels were 6 % wider than high, and straight down on trees all was 24 % too far away."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "phone"
+    if film is not None:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = film
+    (tmp_path / "photographs").mkdir()
+    names = [f"{k}.jpg" for k in range(3)]
+    for name in names:
+        photograph(seed=int(name[0])).save(tmp_path / "photographs" / name, exif=exif)
+    model = {"names": names, "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return [model | {"lenses": [{"names": names, "focal": found}]}] if step == "reconstruct" else []
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    capture(tmp_path / "photographs", tmp_path / "scene")
+    assert ("focal length of 3 photographs, 0.jpg for example, is in doubt" in caplog.text) == bool(told)
+    assert told in caplog.text
+
+
 @pytest.mark.parametrize(("points", "message"), [(49, "only 49 points, each in 3.0 of 5 photographs"), (50, "")])
 def test_a_model_of_a_few_points_is_no_scene(tmp_path, monkeypatch, points, message):
     (tmp_path / "photographs").mkdir()
@@ -1397,7 +1434,9 @@ pycolmap.global_mapping = lambda *_: {0: model}
 pycolmap.incremental_mapping = lambda *_, **__: {}
 (found,) = sfm.reconstruct(folder + "/database.db", folder, folder, has_parallax=True)
 read = pycolmap.Reconstruction(folder)
-print(json.dumps([found["names"], sorted(image.name for image in read.images.values()), sorted(read.cameras)]))
+written = sorted(image.name for image in read.images.values())
+lenses = sorted([len(lens["names"]), *lens["focal"]] for lens in found["lenses"])
+print(json.dumps([found["names"], written, sorted(read.cameras), lenses]))
 """
 
 
@@ -1405,10 +1444,11 @@ def test_photographs_that_global_mapping_places_by_nothing_are_not_registered(tm
     """It keeps all that it began with: tourists' photographs had one of no points and of a negative focal length."""
     command = [sys.executable, "-c", _UNFOUNDED, Path(stages.__file__).parent, tmp_path]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    names, written, cameras = json.loads(printed.splitlines()[-1])
+    names, written, cameras, lenses = json.loads(printed.splitlines()[-1])
     wanted = [(1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]
     assert names == written == [f"camera{camera:06d}_frame{frame:06d}.png" for camera, frame in wanted]
     assert cameras == [1, 2]
+    assert lenses == [[2, 1280, 1280], [3, 1280, 1280]]
 
 
 def test_photographs_of_one_name_in_two_formats_keep_their_own_masks(tmp_path):
