@@ -49,6 +49,8 @@ _LENS_TAGS = (
 
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
 _SMALL, _ALIKE = 32, 4.0  # pixels of a side, and mean difference of levels, by which photographs are compared
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of EXIF's units of resolution: inch, centimetre, millimetre
+_SHRUNK = 0.9  # of a photograph's size in EXIF; a camera may write a few pixels more than it stores
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 
@@ -360,11 +362,13 @@ class Lens:
         size: width and height in pixels.
         names: names of the photographs.
         focal: focal length in pixels of a pinhole camera with its centre in the middle; None if it is to be calibrated.
+        shrunk: focal length in pixels to begin with, where COLMAP would take that from before they were made smaller.
     """
 
     size: tuple[int, int]
     names: list[str]
     focal: float | None = None
+    shrunk: float | None = None
 
 
 def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[Lens]:
@@ -384,7 +388,7 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
             "rig": (name.partition("/")[0],),
             "image": (name,),
         }[cameras]
-        lens = groups.setdefault(key, Lens(size, []))
+        lens = groups.setdefault(key, Lens(size, [], shrunk=_shrunk_focal_length(tags, size)))
         if lens.size != size:
             raise SceneError(
                 f"{lens.names[0]} ({lens.size[0]}x{lens.size[1]}) and {name} ({size[0]}x{size[1]}) cannot share a "
@@ -421,6 +425,21 @@ def focal_length_of_exif(photograph: Path) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
         return None
     return film * diagonal / np.hypot(36, 24) if 0 < film < np.inf else None
+
+
+def _shrunk_focal_length(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
+    """Focal length in pixels of a photograph that was made smaller, by its focal plane's resolution; None of others."""
+    try:
+        if float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0) > 0:
+            return None
+        before = sorted(int(tags[tag]) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
+        across, scale = (now / then for now, then in zip(sorted(size), before, strict=True))
+        unit = _MILLIMETRES[tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)]
+        focal = float(tags[ExifTags.Base.FocalLength]) * float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit * scale
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # anything may be written there
+        return None
+    is_whole = np.isclose(across, scale, rtol=0.02)  # not a part of it, which was cut out
+    return focal if is_whole and scale < _SHRUNK and 0 < focal < np.inf else None
 
 
 def _digital_zoom(tags: Mapping[int, Any]) -> float:

@@ -59,7 +59,8 @@ def extract(
     Args:
         database: COLMAP's database.
         photographs: folder of the photographs.
-        lenses: size and names of the photographs that share a camera, and its focal length in pixels, if it is known.
+        lenses: size and names of the photographs that share a camera, and its focal length in pixels, if it is known,
+            or that to begin with, ``shrunk``, if it is not what EXIF says.
         rigs: cameras that move together: the prefix of their photographs' names, whose rest is the same for those that
             are taken at once, and the rotation from the first camera.
         masks: folder of masks, ``<name>.png``, black where no features are wanted; white ones are added for photographs
@@ -102,7 +103,11 @@ def extract(
         read = {image.name for image in opened.read_all_images()}
         if unread := [name for lens in lenses for name in lens["names"] if name not in read]:
             raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
+        used = {image.name: image.camera_id for image in opened.read_all_images()}
+        shrunk = {used[lens["names"][0]]: lens["shrunk"] for lens in lenses if lens.get("shrunk")}
         for camera in opened.read_all_cameras():
+            if focal := shrunk.get(camera.camera_id):
+                _begin_with(opened, camera, focal)
             _forget_absurd_focal(opened, camera)
         if rigs and not _has_rigs(opened):
             pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
@@ -112,10 +117,14 @@ def _forget_absurd_focal(database: pycolmap.Database, camera: pycolmap.Camera) -
     """Let a camera's focal length be found where EXIF says what no camera has; some write millimetres of the sensor."""
     width, (low, high) = max(camera.width, camera.height), _CREDIBLE
     if camera.has_prior_focal_length and not low < camera.mean_focal_length() / width < high:
-        for k in camera.focal_length_idxs():
-            camera.params[k] = _FOCAL * width
         camera.has_prior_focal_length = False
-        database.update_camera(camera)
+        _begin_with(database, camera, _FOCAL * width)
+
+
+def _begin_with(database: pycolmap.Database, camera: pycolmap.Camera, focal: float) -> None:
+    for k in camera.focal_length_idxs():
+        camera.params[k] = focal
+    database.update_camera(camera)
 
 
 def _add_white(masks: Path, names: list[str], size: list[int]) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import zlib
 from contextlib import closing, nullcontext
+from dataclasses import asdict
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -1412,6 +1413,45 @@ def test_an_absurd_focal_length_of_exif_is_forgotten(tmp_path, said, known):
     ((params, prior),) = rows(tmp_path / "database.db", "SELECT params, prior_focal_length FROM cameras")
     assert prior == known
     assert 0.5 < np.frombuffer(params)[0] / 200 < 1.0
+
+
+_CANON = {  # of 4608 x 3456 pixels on 6.6 x 4.9 mm
+    ExifTags.Base.ExifImageWidth: 4608,
+    ExifTags.Base.ExifImageHeight: 3456,
+    ExifTags.Base.FocalLength: 5.0,
+    ExifTags.Base.FocalPlaneXResolution: 17791.5,
+    ExifTags.Base.FocalPlaneResolutionUnit: 2,
+}
+
+
+@pytest.mark.parametrize(
+    ("changed", "focal"),
+    [
+        ({}, 152.0),
+        ({ExifTags.Base.FocalPlaneXResolution: 700.45, ExifTags.Base.FocalPlaneResolutionUnit: 4}, 152.0),
+        ({ExifTags.Base.ExifImageWidth: 200, ExifTags.Base.ExifImageHeight: 150}, None),  # not made smaller
+        ({ExifTags.Base.FocalLengthIn35mmFilm: 28}, 28 * 250 / np.hypot(36, 24)),  # of any size
+        ({ExifTags.Base.ExifImageHeight: 2592}, None),  # cut out
+        ({ExifTags.Base.ExifImageHeight: 0}, None),
+        ({ExifTags.Base.FocalPlaneXResolution: 0}, None),
+    ],
+)
+def test_a_photograph_that_was_made_smaller_begins_with_the_focal_length_of_its_size(tmp_path, changed, focal):
+    """COLMAP took 3502 pixels of the original's; five of 500 pixels were refused for a lack of parallax."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "a compact"
+    exif.get_ifd(ExifTags.IFD.Exif).update(_CANON | changed)
+    photograph(200, 150).save(tmp_path / "0.jpg", exif=exif)
+    (lens,) = group_by_lens(tmp_path, ["0.jpg"], "auto")
+    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
+    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
+    job |= {"database": str(tmp_path / "database.db"), "lenses": [asdict(lens)]}
+    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+    ((params,),) = rows(tmp_path / "database.db", "SELECT params FROM cameras")
+    if focal:
+        assert np.frombuffer(params)[0] == pytest.approx(focal, rel=1e-3)
+    else:
+        assert lens.shrunk is None
 
 
 _UNFOUNDED = """
