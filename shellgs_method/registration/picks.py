@@ -102,7 +102,10 @@ def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
         point, pixel = np.array(coordinates, dtype=np.float64), (float(row["x"]), float(row["y"]))
         view = view_named(row["image"], views, where)
         if view is None:
-            raise SceneError(f"{where}: {row['image']} is not a photograph of the scene; quote a name with spaces")
+            raise SceneError(
+                f"{where}: {row['image']} is not a photograph of the scene: leave its lines out if its camera was not "
+                "found, and quote a name with spaces"
+            )
         names = {folded(name) for name in (PurePosixPath(view.name).name, view.image.name)}
         if folded(PureWindowsPath(row["image"]).name) not in names:
             captured.append(f"{row['image']} is {view.name}")

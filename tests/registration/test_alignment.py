@@ -613,7 +613,7 @@ def test_names_from_before_the_capture_are_told_once_and_other_spellings_are_non
     [
         ("1 2 3 4 5", "line 2: expected X Y Z"),
         ("1 2 3 4 x images/0.png", "line 2: expected X Y Z"),
-        ("1 2 3 4 5 nowhere.png", "nowhere.png is not a photograph of the scene"),
+        ("1 2 3 4 5 nowhere.png", "nowhere.png is not a photograph of the scene: leave its lines out"),
         ("1 2 9 4 5 images/1.png a", "line 2: the point a has other coordinates"),
         ("1 2 3 4 5 images/0.png a", "line 2: the point a is picked twice"),
         ("1 2 3 4 5 images/1.png 'a", "line 2"),
