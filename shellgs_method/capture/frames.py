@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -53,37 +54,11 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as (container, stream):
         transfer, aspect = _hdr(video, stream), _pixel_aspect(stream)
         is_around = round(stream.width * aspect) == 2 * stream.height
-        task = progress.add_task("looking for sharp frames", total=stream.frames or None)
-        usual = 1 / float(stream.average_rate or 30)
-        sharpnesses, times, marks, shifts, before, last, end = [], [], [], [], None, None, 0.0
-        brightest: UInt8[np.ndarray, "H W"] | None = None
-        for frame in _frames(container, stream):
-            half = frame.reformat(frame.width // 2, frame.height // 2, format="gray").to_ndarray()
-            sharpnesses.append(sharpness(half))
-            if brightest is None or brightest.shape == half.shape:
-                brightest = half if brightest is None else np.maximum(brightest, half)
-            else:  # files of several sizes were joined
-                brightest = np.full((1, 1), 255, np.uint8)
-            step = usual if frame.time is None or last is None else frame.time - last
-            # Times begin anew where files were joined, and jump after a break.
-            times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
-            last, end = frame.time, max(end, frame.time or 0.0)
-            if not marks or times[-1] >= marks[-1] + _PACE:
-                height = max(1, round(_SMALL * frame.height / frame.width))
-                small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
-                marks.append(times[-1])
-                shifts.append(shift(small if before is None or before.shape != small.shape else before, small))
-                before = small
-            progress.update(task, completed=len(times))
-        if brightest is None:
-            raise SceneError(f"{video} holds no frames: is it a complete video?")
-        _tell_of_a_cut(video, stream, end + usual)
-    since = np.array(times)
-    moved = np.interp(since, marks, travelled(np.array(shifts)))
-    if is_around:  # the picture of a panorama moves to all sides at once
-        moved = PANORAMAS_PER_SECOND * STEP * since
-    chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))
-    down, right = (0, 0) if is_around else (2 * width for width in borders(brightest))
+        measured = _measured(video, container, stream, progress)
+    # The picture of a panorama moves to all sides at once.
+    moved = PANORAMAS_PER_SECOND * STEP * measured.since if is_around else measured.moved
+    chosen = sharpest(measured.sharpnesses, *stretches(moved, measured.since, count))
+    down, right = (0, 0) if is_around else (2 * width for width in borders(measured.brightest))
     if down or right:
         notice(
             f"{video} has black borders, of {down} pixels above and below and {right} at the left and the right, which "
@@ -101,6 +76,56 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                 image = _upright(frame, transfer, aspect, (right, down, frame.width - right, frame.height - down))
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """What the first pass over a video measures.
+
+    Attributes:
+        sharpnesses: of each frame, of :func:`sharpness`.
+        since: seconds of each frame since the first.
+        moved: path of the picture up to each frame, of :func:`travelled`.
+        brightest: of each pixel the brightest that any frame shows, at half the size.
+    """
+
+    sharpnesses: Float[np.ndarray, " N"]
+    since: Float[np.ndarray, " N"]
+    moved: Float[np.ndarray, " N"]
+    brightest: UInt8[np.ndarray, "H W"]
+
+
+def _measured(
+    video: Path, container: av.container.InputContainer, stream: VideoStream, progress: Progress
+) -> _Measured:
+    task = progress.add_task("looking for sharp frames", total=stream.frames or None)
+    usual = 1 / float(stream.average_rate or 30)
+    sharpnesses, times, marks, shifts, before, last, end = [], [], [], [], None, None, 0.0
+    brightest: UInt8[np.ndarray, "H W"] | None = None
+    for frame in _frames(container, stream):
+        half = frame.reformat(frame.width // 2, frame.height // 2, format="gray").to_ndarray()
+        sharpnesses.append(sharpness(half))
+        if brightest is None or brightest.shape == half.shape:
+            brightest = half if brightest is None else np.maximum(brightest, half)
+        else:  # files of several sizes were joined
+            brightest = np.full((1, 1), 255, np.uint8)
+        step = usual if frame.time is None or last is None else frame.time - last
+        # Times begin anew where files were joined, and jump after a break.
+        times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
+        last, end = frame.time, max(end, frame.time or 0.0)
+        if not marks or times[-1] >= marks[-1] + _PACE:
+            height = max(1, round(_SMALL * frame.height / frame.width))
+            small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
+            marks.append(times[-1])
+            shifts.append(shift(small if before is None or before.shape != small.shape else before, small))
+            before = small
+        progress.update(task, completed=len(times))
+    if brightest is None:
+        raise SceneError(f"{video} holds no frames: is it a complete video?")
+    _tell_of_a_cut(video, stream, end + usual)
+    since = np.array(times)
+    moved = np.interp(since, marks, travelled(np.array(shifts)))
+    return _Measured(np.array(sharpnesses), since, moved, brightest)
 
 
 def first_frame(video: Path) -> av.VideoFrame | None:
