@@ -91,10 +91,13 @@ def scan_shifts(
     return scans
 
 
-def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]) -> float:
+def mirrored_fit(
+    surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]
+) -> float | None:
     """Fit of the shell mirrored front to back, relative to its own: more than 1 where its file is left-handed.
 
-    Of what is seen from the front, and of points that are not before it, where railings and plants are as well.
+    Of what is seen from the front, and of points that are not in front of it, where railings and plants are as well;
+    None if there are none.
 
     Args:
         surface: the shell.
@@ -108,7 +111,7 @@ def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes
     walls = heights + _NEAR - surface.cast(points + _NEAR * out, -out).t
     told = np.isfinite(walls) & (heights - walls < FIT)
     if not told.any():
-        return 0.0
+        return None
     heights, walls = heights[told], walls[told]
     mirrored = 2 * np.median(heights) - heights
     own, other = (_fits(each - walls + _DEPTHS[:, None]).max() for each in (heights, mirrored))

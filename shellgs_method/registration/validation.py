@@ -110,7 +110,7 @@ class Validation:
         signed: signed distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
         near: share of these among all SfM points.
         scans: fit at shifts along the facade and upwards.
-        mirrored: fit of the shell mirrored front to back, relative to its own.
+        mirrored: fit of the shell mirrored front to back, relative to its own; None if too little of it is seen.
         test: test refinement of the alignment; None if too few points are near the shell.
         correspondences: picks or camera positions and their residuals, if any.
         steps: steps of the coordinates in metres, by what they are of.
@@ -125,7 +125,7 @@ class Validation:
     signed: Float64[np.ndarray, " N"] = field(default_factory=lambda: np.empty(0))
     near: float = 0.0
     scans: Sequence[ShiftScan] = ()
-    mirrored: float = 0.0
+    mirrored: float | None = None
     test: Refinement | None = None
     correspondences: Sequence[Correspondence] = ()
     steps: Mapping[str, Step] = field(default_factory=dict)
@@ -255,7 +255,7 @@ def validate(
         signed=signed[near],
         near=float(near.mean()),
         scans=scan_shifts(surface, placed, axes),
-        mirrored=mirrored_fit(surface, placed[near], axes) if near.any() else 0.0,
+        mirrored=mirrored_fit(surface, placed[near], axes),
         test=test,
         correspondences=correspondences,
         steps=steps,
@@ -309,7 +309,8 @@ def _checks(measured: Validation) -> Iterator[Check]:
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
         yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
-    yield _check("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
+    if measured.mirrored is not None:
+        yield _check("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
     if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 

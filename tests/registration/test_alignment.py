@@ -956,7 +956,10 @@ def test_neither_what_stands_before_a_shell_nor_its_inner_side_tells_that_it_is_
         for n, strip, behind in ((500, 0, 0.0), (400 - railings // 2, 1, 0.2), (railings, 1, -0.2))
     ]
     placed = transformed(np.concatenate(points), surface.survey_from_shell)
-    assert mirrored_fit(surface, placed, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])) < 1
+    axes = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    fit = mirrored_fit(surface, placed, axes)
+    assert fit is not None and fit < 1
+    assert mirrored_fit(surface, placed[:1] + [0.0, 0.0, 50.0], axes) is None
 
 
 def test_limits_work_from_both_sides_and_refuse_nan():
