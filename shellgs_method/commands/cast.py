@@ -79,9 +79,8 @@ def cast(
     """
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from shellgs_method.files.cue_maps import CueMaps
-    from shellgs_method.registration.align import frame_of_matrix, in_its_system, names_in, system_and_unit
-    from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
-    from shellgs_method.shell.cast import seen_through
+    from shellgs_method.registration.align import names_in, system_and_unit
+    from shellgs_method.shell import ALIGNMENT, Alignment
 
     if () in (truth, shell):
         raise SceneError(f"--{'truth' if truth == () else 'shell'} names no file: give one or more, or leave it out")
@@ -114,17 +113,35 @@ def cast(
         how = "mesher" if aligned.mesher != alignment.mesher else "spacing"
         again = f"run `shellgs align {shlex.quote(str(scene))}` again"
         console.print(f"The alignment was validated with another {how}: {again}.", soft_wrap=True)
-    start = time.monotonic()
-    placed = PlacedShell.load(scene, views, aligned)
+    _cast_shell(config, views, aligned, max_image_size, matrix)
+    if check:
+        _check(scene, config)
+    panel = save_panel(CueMaps.open(scene, "shell"), views)
+    console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
+
+
+def _cast_shell(
+    config: FacadeDataParserConfig,
+    views: Sequence[View],
+    alignment: Alignment,
+    max_image_size: int | None,
+    matrix: Path | None,
+) -> None:
+    """Cast the shell, and print how much of the views it covers and what is doubtful."""
+    from shellgs_method.registration.align import frame_of_matrix, in_its_system
+    from shellgs_method.shell import ALIGNMENT, PlacedShell, cast_views
+    from shellgs_method.shell.cast import seen_through
+
+    scene, start = config.data, time.monotonic()
+    placed = PlacedShell.load(scene, views, alignment)
     for meshing in placed.mesh.meshing:
         where = f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}"
         console.print(f"{where}: {meshing}", soft_wrap=True)
-    in_its_system(aligned, placed.mesh).record(scene / ALIGNMENT, views)
-    summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
-    seconds = time.monotonic() - start
+    in_its_system(alignment, placed.mesh).record(scene / ALIGNMENT, views)
+    summary = cast_views(placed, max_image_size=max_image_size, flags=config.flags)
     console.print(
-        f"{summary.cast} views cast, {summary.skipped} already there, in {seconds:.1f} s; the shell is visible "
-        f"in {summary.seeing} of {len(views)} views and covers {summary.supported:.0%} of their pixels."
+        f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the shell "
+        f"is visible in {summary.seeing} of {len(views)} views and covers {summary.supported:.0%} of their pixels."
     )
     if summary.supported < SELDOM:
         hint = frame_of_matrix(config) if matrix else ""
@@ -135,17 +152,13 @@ def cast(
         )
     if placed.mesh.meshing and (through := seen_through(scene, views)) > HOLES:
         poisson = f"`shellgs align {shlex.quote(str(scene))} … --mesher poisson` closes most"
-        remedy = "a denser scan is needed" if aligned.mesher == "poisson" else poisson
+        remedy = "a denser scan is needed" if alignment.mesher == "poisson" else poisson
         console.print(
             f"{through:.1%} of these pixels show what is far behind, through holes of a few pixels in the mesh. Where "
             f"the building has none, as in a round wall, {remedy}.",
             style="yellow",
             soft_wrap=True,
         )
-    if check:
-        _check(scene, config)
-    panel = save_panel(CueMaps.open(scene, "shell"), views)
-    console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 
 
 def _cast_truth(
