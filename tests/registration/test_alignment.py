@@ -958,8 +958,9 @@ def test_neither_what_stands_before_a_shell_nor_its_inner_side_tells_that_it_is_
     placed = transformed(np.concatenate(points), surface.survey_from_shell)
     axes = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     fit = mirrored_fit(surface, placed, axes)
-    assert fit is not None and fit < 1
-    assert mirrored_fit(surface, placed[:1] + [0.0, 0.0, 50.0], axes) is None
+    assert fit is not None
+    assert fit < 1
+    assert mirrored_fit(surface, placed + np.array([0.0, 0.0, 50.0]), axes) is None
 
 
 def test_limits_work_from_both_sides_and_refuse_nan():
