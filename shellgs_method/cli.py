@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import warnings
+from collections.abc import Callable
 
 import tyro
 
@@ -50,8 +53,16 @@ def main() -> None:
     """Entry point."""
     for category in (FutureWarning, SyntaxWarning):  # raised by dependencies, no use to a user
         warnings.filterwarnings("ignore", category=category)
+    for command in COMMANDS:
+        command.__doc__ = inspect.unwrap(command).__doc__ = _paragraphs(command)
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             {command.__name__: command for command in COMMANDS},
+            prog="shellgs",
             description="Prepare scenes, compare methods, evaluate and export runs. `ns-train` trains the methods.",
         )
+
+
+def _paragraphs(command: Callable) -> str:
+    """A command's docstring with a line for each paragraph: tyro keeps line breaks, and narrow terminals add others."""
+    return re.sub(r"(?<=\S)\n(?: {8})?(?=\S)", " ", inspect.getdoc(command) or "")

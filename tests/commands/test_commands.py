@@ -144,6 +144,16 @@ def test_what_no_demo_can_be_made_with_is_refused_before_slow_imports(tmp_path, 
     assert ended.stdout.split() == ["False"]
 
 
+def test_help_has_no_line_breaks_of_docstrings(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "400")
+    monkeypatch.setattr("sys.argv", ["shellgs", "align", "--help"])
+    with pytest.raises(SystemExit):
+        main()
+    said = capsys.readouterr().out
+    assert said.startswith("usage: shellgs align [-h]")
+    assert "whose first line names another one, such as" in said
+
+
 def test_ns_eval_writes_all_metrics(demo):
     metrics = json.loads((config(demo).parent / "eval.json").read_text())["results"]
     assert {
