@@ -44,6 +44,7 @@ from shellgs_method.occlusion.exposure import (
     points_on_surface,
     sightings_on_surface,
 )
+from shellgs_method.occlusion.low_light import LowLight
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
@@ -51,7 +52,7 @@ NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
-VERSION = 14
+VERSION = 15
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -135,11 +136,12 @@ def compared_others(checked: CueMaps, views: Sequence[View], held_out: Collectio
 
 @dataclass(frozen=True)
 class _TrainingViews:
-    """The training views at their mean exposure, their sweeps, and the colours in front of the shell and on it."""
+    """The training views as they are compared, their sweeps, and the colours in front of the shell and on it."""
 
     views: dict[str, ShellView]
     surface: SurfaceColours
     """The shell's colours at their mean exposure."""
+    light: LowLight
     sweeps: dict[str, Sweep]
     colours: ColourModel
     error: float
@@ -160,6 +162,8 @@ class _TrainingViews:
         shell_views = {
             name: _at_mean_exposure(seen, gain) for (name, seen), gain in zip(taken.items(), gains, strict=True)
         }
+        light = LowLight.of(shell_views.values())
+        shell_views = {name: light.comparable(seen) for name, seen in shell_views.items()}
         files = {name: unfinished / f"{index}.npy" for index, name in enumerate(shell_views)}
         missing = [name for name, file in files.items() if not file.is_file()]
 
@@ -176,7 +180,7 @@ class _TrainingViews:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
         colours = ColourModel(shell_views.values(), sweeps.values())
-        return cls(shell_views, surface, sweeps, colours, _error(shell.manifest), windows)
+        return cls(shell_views, surface, light, sweeps, colours, _error(shell.manifest), windows)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -184,7 +188,7 @@ class _TrainingViews:
             seen, found = self.views[view.name], self.sweeps[view.name]
         else:
             seen = _shell_view(view, cue)
-            seen = _at_mean_exposure(seen, self.surface.log_gain(_exposed(seen)))
+            seen = self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
             found = sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]

@@ -27,6 +27,7 @@ from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trus
 from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.photographs import View
+from shellgs_method.files.transfer import POWER
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -54,6 +55,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
+from shellgs_method.occlusion.low_light import DARK, LowLight, noise
 from shellgs_method.occlusion.verdicts import Verdicts
 from shellgs_method.viewer import ContradictedShell
 
@@ -151,6 +153,57 @@ def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     assert both / contradicted.sum() > 0.8
     inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
     assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
+
+
+def at_night(views: list[ShellView], brightness: float, sigma: float) -> list[ShellView]:
+    """The views at a fraction of their brightness, with noise."""
+    rng = np.random.default_rng(0)
+
+    def taken(image: torch.Tensor) -> torch.Tensor:
+        return (brightness * image + torch.from_numpy(rng.normal(0, sigma, image.shape))).round().clamp(0, 255).byte()
+
+    return [replace(view, image=taken(view.image)) for view in views]
+
+
+@pytest.mark.parametrize(("brightness", "sigma"), [(0.07, 0.0), (0.1, 6.0)])
+def test_a_post_is_found_in_photographs_of_little_light(brightness: float, sigma: float):
+    views = street(CAMERAS, post=5.0)
+    dark, before = at_night([view for view, _ in views], brightness, sigma), views[MIDDLE][1]
+    light = LowLight.of(dark)
+    assert light.is_noisy == (sigma > 0)
+
+    def found(views: list[ShellView]) -> float:
+        contradicted = scores(views)[1].numpy() > CONTRADICTED
+        return (before & contradicted).sum() / (before | contradicted).sum()
+
+    assert found([light.comparable(view) for view in dark]) > 0.9
+    assert found(dark) < 0.5
+
+
+def test_photographs_by_day_are_compared_as_they_are_and_dark_ones_with_more_exposure():
+    day = [view for view, _ in street(CAMERAS)]
+    light = LowLight.of(day)
+    assert all(torch.equal(light.comparable(view).image, view.image) for view in day)
+    dark = [
+        replace(view, image=(255 * exposed(view.image / 255, torch.tensor(-3.0))).round().clamp(0, 255).byte())
+        for view in day
+    ]
+    light = LowLight.of(dark)
+    assert light.scale > 1.5
+    for view, raised in zip(dark, map(light.comparable, dark), strict=True):
+        expected = exposed(view.image / 255, torch.tensor(np.log(light.scale) / POWER))
+        assert torch.equal(raised.image, (255 * expected).round().clamp(0, 255).byte())
+    medians = [float(light.comparable(view).image.float().mean(dim=-1).median()) for view in dark]
+    assert np.median(medians) == pytest.approx(DARK, abs=1)
+    nowhere = [replace(view, depth=torch.zeros_like(view.depth)) for view in dark]
+    assert LowLight.of(nowhere) == LowLight(1.0, False)
+
+
+def test_noise_is_measured_beside_slopes_and_edges():
+    rng, (y, x) = np.random.default_rng(0), np.mgrid[:120, :160]
+    image = 20 + 0.3 * x + 0.2 * y + 60 * (x > 80) + 40 * (y > 50)
+    for sigma in (1.0, 8.0):
+        assert noise((image + rng.normal(0, sigma, image.shape)).astype(np.float32)) == pytest.approx(sigma, rel=0.05)
 
 
 def test_a_post_is_found_by_photographs_that_are_far_apart():
