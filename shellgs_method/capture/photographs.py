@@ -37,6 +37,7 @@ from shellgs_method.files.paths import (
 from shellgs_method.files.profiles import hdr_of, is_srgb
 
 _EXCERPT = 4096  # bytes
+_THUMBNAIL, _BRIGHT = 320, 90  # pixels of a photograph whose brightness is measured; its median, of 255, by day
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
 _LENS_TAGS = (
@@ -396,6 +397,15 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
             )
         lens.names.append(name)
     return list(groups.values())
+
+
+def contrast(path: Path) -> float:
+    """Contrast that little light leaves a photograph, relative to one by day: a power of two, at most 1."""
+    with Image.open(path) as image:
+        image.draft("L", (_THUMBNAIL, _THUMBNAIL))
+        grey = image.convert("L")
+        grey.thumbnail((_THUMBNAIL, _THUMBNAIL))
+    return min(1.0, 2.0 ** round(np.log2(max(float(np.median(np.asarray(grey))), 1.0) / _BRIGHT)))
 
 
 def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:

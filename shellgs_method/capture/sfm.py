@@ -52,6 +52,7 @@ def extract(
     rigs: list[list[dict]],
     masks: str | None,
     sift: dict,
+    contrasts: dict[str, float],
     camera_model: str,
 ) -> None:
     """Extract features of all photographs that have none yet; each lens is one camera.
@@ -67,14 +68,13 @@ def extract(
             without one, which COLMAP would leave out.
         sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
             the doubled image, which smaller photographs need.
+        contrasts: contrast of each photograph relative to one by day: features of COLMAP have a least contrast, and at
+            a fifth of the light one in 25 was left.
         camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
     """
     for lens in lenses:
         if masks:
             _add_white(Path(masks), lens["names"], lens["size"])
-        options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
-        options.sift.max_num_features = sift["max_num_features"]
-        options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
         reader = pycolmap.ImageReaderOptions(
             camera_model=camera_model if len(lens["names"]) >= _MIN_CALIBRATED else "SIMPLE_RADIAL",
             mask_path=masks or "",
@@ -84,21 +84,21 @@ def extract(
             width, height = lens["size"]
             reader.camera_model = _CALIBRATED
             reader.camera_params = f"{lens['focal']},{width / 2},{height / 2}"
-        with pycolmap.Database.open(database) as opened:  # may hold the results of an interrupted run
-            images = opened.read_all_images()
-            cameras = {image.camera_id for image in images if image.name in lens["names"]}
-            # A camera is written before the features of its first photograph.
-            unused = {camera.camera_id for camera in opened.read_all_cameras()} - {image.camera_id for image in images}
-        if cameras or unused:
-            reader.existing_camera_id = min(cameras or unused)
-        pycolmap.extract_features(
-            database,
-            photographs,
-            image_names=lens["names"],
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=options,
-        )
+        for contrast in sorted({contrasts[name] for name in lens["names"]}):
+            if camera := _camera_of(database, lens["names"]):
+                reader.existing_camera_id = camera
+            options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
+            options.sift.max_num_features = sift["max_num_features"]
+            options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
+            options.sift.peak_threshold *= contrast
+            pycolmap.extract_features(
+                database,
+                photographs,
+                image_names=[name for name in lens["names"] if contrasts[name] == contrast],
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+            )
     with pycolmap.Database.open(database) as opened:
         read = {image.name for image in opened.read_all_images()}
         if unread := [name for lens in lenses for name in lens["names"] if name not in read]:
@@ -111,6 +111,16 @@ def extract(
             _forget_absurd_focal(opened, camera)
         if rigs and not _has_rigs(opened):
             pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
+
+
+def _camera_of(database: str, names: list[str]) -> int | None:
+    """The camera of a lens, if some of its photographs have been read, perhaps by a run that was interrupted."""
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+        cameras = {image.camera_id for image in images if image.name in names}
+        # A camera is written before the features of its first photograph.
+        unused = {camera.camera_id for camera in opened.read_all_cameras()} - {image.camera_id for image in images}
+    return min(cameras or unused, default=None)
 
 
 def _forget_absurd_focal(database: pycolmap.Database, camera: pycolmap.Camera) -> None:

@@ -36,6 +36,7 @@ from shellgs_method.capture.panoramas import (
 from shellgs_method.capture.photographs import (
     add_mask,
     add_photograph,
+    contrast,
     find_masks,
     find_photographs,
     focal_length_of_exif,
@@ -260,6 +261,7 @@ class _Capture:
                 rigs=[face_rig()] if faces else [],
                 masks=str(self.work.folder / "masks") if self.masked else None,
                 sift=_SIFT[self.config.quality],
+                contrasts={name: contrast(self.folder / name) for name in self.names},
                 camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
             )
         _tidy(database)

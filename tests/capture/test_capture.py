@@ -35,6 +35,7 @@ from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
     add_photograph,
+    contrast,
     find_masks,
     find_photographs,
     group_by_lens,
@@ -1360,7 +1361,7 @@ def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_
 
     def extract(database: Path, count: int) -> None:
         job = {"photographs": str(tmp_path / "photographs"), "masks": None, "rigs": [], "sift": sift}
-        job |= {"camera_model": "OPENCV"}
+        job |= {"camera_model": "OPENCV", "contrasts": dict.fromkeys(("0.png", "1.png", "2.png"), 1.0)}
         job |= {"database": str(database), "lenses": lenses[:count]}
         run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
 
@@ -1382,6 +1383,38 @@ def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_
             assert rows(stopped, query) == rows(whole, query)
 
 
+def extracted(photographs: Path, names: list[str], **job: Any) -> Path:
+    """Extract features of some photographs of one lens, of 200 x 150 pixels; return COLMAP's database."""
+    database = photographs / "database.db"
+    job = {
+        "masks": None,
+        "rigs": [],
+        "camera_model": "OPENCV",
+        "contrasts": dict.fromkeys(names, 1.0),
+        "sift": {"max_image_size": 1600, "max_num_features": 10000, "first_octave": -1},
+        "photographs": str(photographs),
+        "lenses": [{"size": [200, 150], "names": names, "focal": None}],
+        "database": str(database),
+    } | job
+    run_step("extract", job, log=photographs / "log", progress=QUIET, description="", total=1)
+    return database
+
+
+def test_dark_photographs_have_as_many_features(tmp_path):
+    """COLMAP's features have a least contrast, of light as bright as white."""
+    day = photograph(200, 150)
+    lights = {"day.png": 1.0, "dusk.png": 0.3, "night.png": 0.1}
+    for name, light in lights.items():
+        Image.fromarray((light * np.asarray(day)).round().astype(np.uint8)).save(tmp_path / name)
+    contrasts = {name: contrast(tmp_path / name) for name in lights}
+    assert contrasts == {"day.png": 1, "dusk.png": 0.5, "night.png": 0.125}
+    database = extracted(tmp_path, list(lights), contrasts=contrasts)
+    found = rows(database, "SELECT name, rows, camera_id FROM images JOIN keypoints USING (image_id)")
+    number = {name: count for name, count, _ in found}
+    assert {camera for *_, camera in found} == {1}
+    assert min(number["dusk.png"], number["night.png"]) > 0.8 * number["day.png"] > 50
+
+
 def test_photographs_without_a_mask_have_features_all_over_where_others_have_masks(tmp_path):
     """COLMAP leaves out photographs without a mask."""
     (tmp_path / "photographs").mkdir()
@@ -1389,12 +1422,8 @@ def test_photographs_without_a_mask_have_features_all_over_where_others_have_mas
     for name in ("0.png", "1.png"):
         photograph(200, 150, seed=int(name[0])).save(tmp_path / "photographs" / name)
     Image.new("L", (200, 150)).save(tmp_path / "masks" / "0.png.png")
-    job: dict[str, Any] = {"photographs": str(tmp_path / "photographs"), "masks": str(tmp_path / "masks"), "rigs": []}
-    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}, "camera_model": "OPENCV"}
-    job |= {"database": str(tmp_path / "database.db")}
-    job |= {"lenses": [{"size": [200, 150], "names": ["0.png", "1.png"], "focal": None}]}
-    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
-    counts = rows(tmp_path / "database.db", "SELECT name, rows > 0 FROM images JOIN keypoints USING (image_id)")
+    database = extracted(tmp_path / "photographs", ["0.png", "1.png"], masks=str(tmp_path / "masks"))
+    counts = rows(database, "SELECT name, rows > 0 FROM images JOIN keypoints USING (image_id)")
     assert counts == [("0.png", 0), ("1.png", 1)]
 
 
@@ -1405,12 +1434,8 @@ def test_an_absurd_focal_length_of_exif_is_forgotten(tmp_path, said, known):
     exif[ExifTags.Base.Model] = "phone"
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = said
     photograph(200, 150).save(tmp_path / "0.jpg", exif=exif)
-    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
-    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
-    job |= {"database": str(tmp_path / "database.db")}
-    job |= {"lenses": [{"size": [200, 150], "names": ["0.jpg"], "focal": None}]}
-    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
-    ((params, prior),) = rows(tmp_path / "database.db", "SELECT params, prior_focal_length FROM cameras")
+    database = extracted(tmp_path, ["0.jpg"])
+    ((params, prior),) = rows(database, "SELECT params, prior_focal_length FROM cameras")
     assert prior == known
     assert 0.5 < np.frombuffer(params)[0] / 200 < 1.0
 
@@ -1443,11 +1468,8 @@ def test_a_photograph_that_was_made_smaller_begins_with_the_focal_length_of_its_
     exif.get_ifd(ExifTags.IFD.Exif).update(_CANON | changed)
     photograph(200, 150).save(tmp_path / "0.jpg", exif=exif)
     (lens,) = group_by_lens(tmp_path, ["0.jpg"], "auto")
-    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
-    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
-    job |= {"database": str(tmp_path / "database.db"), "lenses": [asdict(lens)]}
-    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
-    ((params,),) = rows(tmp_path / "database.db", "SELECT params FROM cameras")
+    database = extracted(tmp_path, ["0.jpg"], lenses=[asdict(lens)])
+    ((params,),) = rows(database, "SELECT params FROM cameras")
     if focal:
         assert np.frombuffer(params)[0] == pytest.approx(focal, rel=1e-3)
     else:
@@ -1513,12 +1535,8 @@ def test_photographs_of_one_name_in_two_formats_keep_their_own_masks(tmp_path):
 def test_a_photograph_that_colmap_cannot_read_is_named(tmp_path):
     photograph(200, 150).save(tmp_path / "0.png")
     (tmp_path / "1.png").write_bytes(b"what Pillow reads, and COLMAP does not")
-    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
-    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
-    job |= {"database": str(tmp_path / "database.db")}
-    job |= {"lenses": [{"size": [200, 150], "names": ["0.png", "1.png"], "focal": None}]}
     with pytest.raises(SceneError, match=r"COLMAP cannot read 1\.png: save it again"):
-        run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+        extracted(tmp_path, ["0.png", "1.png"])
 
 
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])
