@@ -27,6 +27,8 @@ _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
 _EDITION = re.compile(r"(IFC2X3|IFC4|IFC4X3)(_TC\d|_ADD\d|_FINAL)*")
 """Editions that differ in nothing that is read here; release candidates and IFC4X1 do."""
 _DATA = re.compile(rb"(?:^|;)\s*(DATA\s*;)", re.IGNORECASE | re.MULTILINE)
+_NO_LETTERS = b"\\X2\\\\X0\\"
+"""Letters of another alphabet, of which there are none: ifcopenshell reads nothing of a file with them."""
 _HEADER = b"""ISO-10303-21;
 HEADER;
 FILE_DESCRIPTION((''),'2;1');
@@ -151,7 +153,7 @@ def _opened(path: Path, ifcopenshell: ModuleType) -> Any:
                 ) from error
         known = "IFC4X3_ADD2" if edition[1] == "IFC4X3" else edition[1]
         copy = Path(folder, "copy.ifc")
-        copy.write_bytes(_HEADER % known.encode() + data[begin.start(1) :])
+        copy.write_bytes(_HEADER % known.encode() + data[begin.start(1) :].replace(_NO_LETTERS, b""))
         ifcopenshell.get_log()
         try:
             return ifcopenshell.open(copy)
