@@ -34,7 +34,7 @@ from shellgs_method.files.paths import (
     photographs_in,
     tell_of_masks,
 )
-from shellgs_method.files.profiles import hdr_of, is_srgb
+from shellgs_method.files.profiles import is_srgb
 
 _EXCERPT = 4096  # bytes
 _THUMBNAIL, _BRIGHT = 320, 90  # pixels of a photograph whose brightness is measured; its median, of 255, by day
@@ -204,8 +204,8 @@ def add_photograph(source: Path, target: Path) -> None:
     wanted = CAPTURED[target.suffix.lower()]
     image = read_image(source)
     with Image.open(source) as stored:
-        is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data and not hdr_of(stored, source)
-        is_usable = stored.format == wanted and is_plain and is_srgb(stored) and orientation_of(image) == 1
+        is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data
+        is_usable = stored.format == wanted and is_plain and is_srgb(stored, source) and orientation_of(image) == 1
     if not is_usable:
         upright = ImageOps.exif_transpose(without_hidden(image)).convert("RGB")
         upright.save(target, wanted, quality=95, subsampling=0, exif=exif_of(upright))

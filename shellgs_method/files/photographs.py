@@ -18,8 +18,8 @@ from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
-from shellgs_method.files.profiles import hdr_of, in_srgb
-from shellgs_method.files.transfer import tone_mapped
+from shellgs_method.files.profiles import hdr_of, in_srgb, primaries_of
+from shellgs_method.files.transfer import WIDE, narrowed, tone_mapped
 from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
@@ -206,6 +206,11 @@ def read_image(path: Path) -> Image.Image:
             )
             codes = _wide(path) if "nclx_profile" in image.info else np.asarray(image.convert("RGB"), np.uint16) * 257
             image = Image.fromarray(tone_mapped(codes, transfer))
+        elif (primaries := primaries_of(image, path)) in WIDE and image.mode in ("RGB", "RGBA"):
+            shown = Image.fromarray(narrowed(np.asarray(image)[..., :3], primaries))
+            if image.mode == "RGBA":
+                shown.putalpha(image.getchannel("A"))
+            image = shown
         if image.mode.startswith("I"):
             if np.max(image.getextrema()) > np.iinfo(np.uint16).max:
                 raise SceneError(

@@ -11,13 +11,13 @@ from pathlib import Path
 from PIL import ExifTags, Image, ImageCms
 
 from shellgs_method.files.exif import exif_of
-from shellgs_method.files.transfer import HDR, Transfer
+from shellgs_method.files.transfer import HDR, WIDE, Transfer
 
 _ADOBE = "R03"  # interoperability index of a camera's file in Adobe RGB (DCF 2.0), which embeds no profile
 _ALIKE = 2  # levels of 8 bits, to which profiles of sRGB differ
-_CODES = {  # where files that Pillow says nothing of have the code of their transfer function
-    "AVIF": re.compile(rb"colrnclx..(..)", re.DOTALL),
-    "PNG": re.compile(rb"\0\0\0\x04cICP.(.)", re.DOTALL),
+_CODES = {  # where files that Pillow says nothing of have the codes of their primaries and their transfer function
+    "AVIF": re.compile(rb"colrnclx(..)(..)", re.DOTALL),
+    "PNG": re.compile(rb"\0\0\0\x04cICP(.)(.)", re.DOTALL),
 }
 _HEAD = 1 << 16  # bytes of a file that hold its header
 _INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
@@ -30,18 +30,30 @@ def hdr_of(image: Image.Image, path: Path) -> Transfer | None:
         image: the photograph.
         path: its file.
     """
+    return HDR.get(_codes_of(image, path)[1])
+
+
+def primaries_of(image: Image.Image, path: Path) -> int:
+    """Code of a photograph's primaries (ITU-T H.273); 0 where a profile says what its colours are, or nothing does."""
+    return 0 if image.info.get("icc_profile") else _codes_of(image, path)[0]
+
+
+def _codes_of(image: Image.Image, path: Path) -> tuple[int, int]:
+    """Codes of a photograph's primaries and transfer function (ITU-T H.273); 0 where nothing says them."""
     if "nclx_profile" in image.info:
-        return HDR.get((image.info["nclx_profile"] or {}).get("transfer_characteristics", 0))
+        said = image.info["nclx_profile"] or {}
+        return said.get("color_primaries", 0), said.get("transfer_characteristics", 0)
     if (pattern := _CODES.get(str(image.format))) is None:
-        return None
+        return 0, 0
     with path.open("rb") as file:
         found = pattern.search(file.read(_HEAD).partition(b"IDAT")[0])
-    return HDR.get(int.from_bytes(found[1], "big")) if found else None
+    return (int.from_bytes(found[1], "big"), int.from_bytes(found[2], "big")) if found else (0, 0)
 
 
-def is_srgb(image: Image.Image) -> bool:
-    """Whether the colours of an image are sRGB's, as far as it says."""
-    return _transform_of(image) is None
+def is_srgb(image: Image.Image, path: Path) -> bool:
+    """Whether the colours of an image are sRGB's, as far as it says; arguments are as of :func:`hdr_of`."""
+    is_plain = hdr_of(image, path) is None and primaries_of(image, path) not in WIDE
+    return is_plain and _transform_of(image) is None
 
 
 def in_srgb(image: Image.Image) -> Image.Image:

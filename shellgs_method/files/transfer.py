@@ -25,8 +25,8 @@ _BT709_FROM_BT2020 = np.array(  # ITU-R BT.2087
 _BT709_FROM_P3 = np.array(  # SMPTE EG 432-1, whose white is that of BT.709
     [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]], np.float32
 )
-_WIDE = {9: _BT709_FROM_BT2020, 12: _BT709_FROM_P3}
-"""Matrices from wider primaries, by their codes in files (colour primaries of ITU-T H.273)."""
+WIDE = {9: _BT709_FROM_BT2020, 12: _BT709_FROM_P3}
+"""Matrices to BT.709 from wider primaries, by their codes in files (colour primaries of ITU-T H.273)."""
 _KNEE = 0.5  # of diffuse white: darker colours are kept, brighter ones leave room for highlights
 
 
@@ -50,7 +50,7 @@ def tone_mapped(rgb: UInt16[np.ndarray, "H W 3"], transfer: Transfer) -> UInt8[n
 
 def narrowed(rgb: UInt8[np.ndarray, "H W 3"], primaries: int) -> UInt8[np.ndarray, "H W 3"]:
     """Colours of wider primaries, by their code in files, as sRGB has them, clipped; those of others as they are."""
-    if (matrix := _WIDE.get(primaries)) is None:
+    if (matrix := WIDE.get(primaries)) is None:
         return rgb
     linear = linear_of(np.linspace(0, 1, 256)).astype(np.float32)[rgb] @ matrix.T
     return np.rint(255 * srgb(linear.clip(0, 1))).astype(np.uint8)

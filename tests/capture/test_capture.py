@@ -301,6 +301,23 @@ def test_colours_of_a_video_of_wider_primaries_are_converted(tmp_path, primaries
         np.testing.assert_allclose(np.asarray(frame).mean(axis=(0, 1)), shown, atol=4)
 
 
+@pytest.mark.parametrize("name", ["a.avif", "a.png", "a.heic"])
+def test_a_photograph_of_p3_by_its_codes_is_converted(tmp_path, name):
+    """Without a profile: as encoders of AVIF, PNG and HEIF write it."""
+    path, p3 = tmp_path / name, 12
+    if path.suffix == ".heic":
+        path.write_bytes(PHONE.read_bytes().replace(b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x0c\0\x0d"))
+        stored = np.asarray(read_image(PHONE))[8, 8]
+    else:
+        stored = np.array([190, 95, 67])
+        _of_codes(path, Image.new("RGB", (32, 24), tuple(stored)), p3, 13)
+    shown = 255 * srgb(np.clip(np.linalg.solve(BT709, WIDER[p3] @ linear_of(stored / 255)), 0, 1))
+    assert np.abs(shown - stored).max() > 4
+    np.testing.assert_allclose(np.asarray(read_image(path))[8, 8], shown, atol=3)
+    add_photograph(path, tmp_path / "captured.png")
+    np.testing.assert_allclose(np.asarray(read_image(tmp_path / "captured.png"))[8, 8], shown, atol=3)
+
+
 def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:
     """A file of several video streams: size, number of frames and properties of each; blue but for the last, red."""
     with av.open(str(path), "w") as container:
@@ -395,15 +412,15 @@ def test_8_bits_of_an_hdr_photograph_are_tone_mapped_too(tmp_path):
     np.testing.assert_allclose(mapped.astype(int), tone_mapped(wide, "HLG").astype(int), atol=1)
 
 
-def _of_pq(path: Path, shown: Image.Image) -> None:
-    """Write a photograph that says, as AVIF and PNG do, that its colours are of PQ."""
-    shown.save(path)
+def _of_codes(path: Path, shown: Image.Image, primaries: int, transfer: int) -> None:
+    """Write a photograph that says, as AVIF and PNG do, what its colours are, by codes of ITU-T H.273."""
+    shown.save(path, quality=100)
     content = path.read_bytes()
     if path.suffix == ".avif":
         head, mark, rest = content.partition(b"colrnclx")
-        path.write_bytes(head + mark + b"\0\x09\0\x10" + rest[4:])
+        path.write_bytes(head + mark + bytes([0, primaries, 0, transfer]) + rest[4:])
         return
-    chunk = b"cICP" + bytes([9, 16, 0, 1])
+    chunk = b"cICP" + bytes([primaries, transfer, 0, 1])
     chunk = b"\0\0\0\x04" + chunk + zlib.crc32(chunk).to_bytes(4, "big")
     path.write_bytes(content[:33] + chunk + content[33:])  # after the header
 
@@ -414,14 +431,14 @@ def test_an_hdr_photograph_of_any_format_is_tone_mapped(tmp_path, caplog, suffix
     shown.save(tmp_path / f"sdr{suffix}")
     assert np.asarray(read_image(tmp_path / f"sdr{suffix}")).mean() == pytest.approx(97, abs=1)
     assert not caplog.records
-    _of_pq(tmp_path / f"hdr{suffix}", shown)
+    _of_codes(tmp_path / f"hdr{suffix}", shown, 9, 16)
     expected = tone_mapped(np.full((1, 1, 3), 97 * 257, np.uint16), "PQ").mean()
     assert np.asarray(read_image(tmp_path / f"hdr{suffix}")).mean() == pytest.approx(expected, abs=3)
     assert "holds HDR photographs (PQ), which are tone-mapped" in caplog.text
 
 
 def test_an_hdr_png_is_captured_in_srgb(tmp_path):
-    _of_pq(tmp_path / "hdr.png", Image.new("RGB", (32, 24), (97, 97, 97)))
+    _of_codes(tmp_path / "hdr.png", Image.new("RGB", (32, 24), (97, 97, 97)), 9, 16)
     add_photograph(tmp_path / "hdr.png", tmp_path / "captured.png")
     with Image.open(tmp_path / "captured.png") as captured:
         mapped = tone_mapped(np.full((1, 1, 3), 97 * 257, np.uint16), "PQ")
