@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ _LENS_TAGS = (
 )
 
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
+_IN_ORDER = 0.5  # of the steps from one photograph to the next, that are between neighbours by name
 _SMALL, _ALIKE = 32, 4.0  # pixels of a side, and mean difference of levels, by which photographs are compared
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of EXIF's units of resolution: inch, centimetre, millimetre
 _SHRUNK = 0.9  # of a photograph's size in EXIF; a camera may write a few pixels more than it stores
@@ -450,6 +452,31 @@ def _shrunk_focal_length(tags: Mapping[int, Any], size: tuple[int, int]) -> floa
         return None
     is_whole = np.isclose(across, scale, rtol=0.02)  # not a part of it, which was cut out
     return focal if is_whole and scale < _SHRUNK and 0 < focal < np.inf else None
+
+
+def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> None:
+    """Tell the user of photographs that were taken in another order than that of their names, by EXIF.
+
+    Args:
+        folder: folder of the photographs.
+        names: their names, in the order in which neighbours are matched.
+        overlap: how many after each of them are.
+    """
+    walks: dict[tuple, list[tuple[str, str, int]]] = {}  # of each folder and camera: times, and places by name
+    for name in names:
+        with Image.open(folder / name) as image:
+            tags = tags_of(image)
+        when, fraction, *camera = (str(tags.get(tag, "")).strip() for tag in (*_MOMENT, *_LENS_TAGS[:2]))
+        if when:
+            walk = walks.setdefault((name.rpartition("/")[0], *camera), [])
+            walk.append((when, fraction, len(walk)))
+    steps = [abs(a[2] - b[2]) for walk in walks.values() for a, b in pairwise(sorted(walk))]
+    if sum(step <= overlap for step in steps) < _IN_ORDER * len(steps):
+        notice(
+            f"The names of the photographs, {names[0]} for example, do not follow the order in which they were taken, "
+            "by EXIF, but are what neighbours are looked for by: cameras may be metres off. Rename them by time, or "
+            "use --matching exhaustive."
+        )
 
 
 def _digital_zoom(tags: Mapping[int, Any]) -> float:

@@ -43,6 +43,7 @@ from shellgs_method.capture.photographs import (
     group_by_lens,
     keep_exposure,
     masks_as_stored,
+    tell_of_another_order,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -272,6 +273,8 @@ class _Capture:
             return
         shots = taken_at_once(self.names, self.rig or FACES)
         matching = choose_matching(self.config.matching, len(shots), self.is_video)
+        if matching == "sequential" and not self.is_video:
+            tell_of_another_order(self.folder, self.names, self.config.overlap)
         turned = matching == "exhaustive"
         near = image_pairs(list(shots), matching, self.config.overlap)
         pairs = [pair for a, b in near for pair in face_pairs(shots[a], shots[b], turned=turned)]

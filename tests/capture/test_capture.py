@@ -41,6 +41,7 @@ from shellgs_method.capture.photographs import (
     group_by_lens,
     keep_exposure,
     masks_as_stored,
+    tell_of_another_order,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -702,6 +703,22 @@ def test_photographs_that_do_not_say_their_lens_are_told(tmp_path, caplog):
     assert caplog.text == ""
     tell_of_unknown_lenses(tmp_path, [f"{k}.jpg" for k in range(5)])
     assert "3 of 5 photographs, 2.jpg for example, do not say" in caplog.text
+
+
+@pytest.mark.parametrize(("kind", "told"), [("random", True), ("in order", False), ("two cameras", False), ("", False)])
+def test_names_in_another_order_than_the_walk_are_told(tmp_path, caplog, kind, told):
+    """As of photographs that are named by random letters; two phones at once alternate in time, not by name."""
+    order = np.random.default_rng(0).permutation(40) if kind == "random" else np.arange(40)
+    if kind == "two cameras":
+        order = np.argsort(np.arange(40) % 2, kind="stable")  # 0, 2, ..., 1, 3, ...
+    for k, place in enumerate(order):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = str(place % 2) if kind == "two cameras" else "A"
+        if kind:
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] = f"2026:05:01 12:00:{place:02d}"
+        photograph(16, 12).save(tmp_path / f"{k:02d}.jpg", exif=exif)
+    tell_of_another_order(tmp_path, [f"{k:02d}.jpg" for k in range(40)], 5)
+    assert ("do not follow the order in which they were taken" in caplog.text) == told
 
 
 def test_a_photograph_of_200_megapixels_is_refused_with_what_to_do(tmp_path, monkeypatch):
