@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 
 from loops import CONFIRMED, DRIFT, View, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
+from zoom import zoomed  # pyright: ignore[reportMissingImports]  isort: skip
 
 SEED = 0
 _RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
@@ -39,10 +40,6 @@ _CREDIBLE = 0.3, 10.0  # widths that EXIF may say, 11 to 360 mm on 35 mm film; 4
 _NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 _LEAST_POINTS = 10  # of a photograph with a camera: 17 and more of right ones, incremental mapping places none by 30
-_POINTS = 80  # of a photograph, by which its own focal length is found
-# F, and deviation of focal lengths, at which photographs have not one camera. Right models have 7 and less, but one of
-# 30 at a deviation of 0.02; videos with frames cropped by a tenth, a zoom or two lenses 39 and 0.07 and more.
-_ZOOMED = 20.0, 0.03
 
 
 def extract(
@@ -328,7 +325,7 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
             "reprojection_error": model.compute_mean_reprojection_error(),
             "track_length": model.compute_mean_track_length(),
             "torn": weakest(model).between if weakest(model).confirmed < CONFIRMED else None,
-            "zoomed": _zoomed(model) if is_alone and model is ranked[0] else None,
+            "zoomed": zoomed(model, _registered(model), _MIN_CALIBRATED) if is_alone and model is ranked[0] else None,
             "lenses": _shared_lenses(model),
         }
         for model in ranked
@@ -346,82 +343,6 @@ def _placed(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         manager.deregister_frame(frame)
     model.tear_down()  # their cameras, too
     return model
-
-
-def _zoomed(model: pycolmap.Reconstruction) -> list | None:
-    """How much the focal length changes between photographs of a camera, as a share of it, and the names of two.
-
-    None if one for each camera explains the photographs as well as one for each photograph (F-test of two bundle
-    adjustments, of some points).
-    """
-    images = sorted(_registered(model), key=lambda image: along_the_walk(image.name))
-    used = Counter(image.camera_id for image in images)
-    known = [image.image_id for image in images if used[image.camera_id] >= _MIN_CALIBRATED]
-    points = _some_points(model)
-    if not known or not points:
-        return None
-    (together, _, _), (apart, focal, freedom) = (_adjusted(model, images, points, own=own) for own in (False, True))
-    logs = {k: np.log([focal[i] for i in known if model.image(i).camera_id == k]) for k in used}
-    off = {i: np.log(focal[i]) - np.median(logs[model.image(i).camera_id]) for i in known}
-    least_f, least_deviation = _ZOOMED
-    is_better = (together - apart) * max(1, freedom) > least_f * apart * (len(images) - len(used))
-    deviation = np.subtract(*np.quantile(list(off.values()), [0.84, 0.16])) / 2
-    if not is_better or not deviation > least_deviation:
-        return None
-    ranked = sorted(known, key=off.__getitem__)
-    short, long = ranked[len(ranked) // 20], ranked[-1 - len(ranked) // 20]
-    return [float(np.expm1(off[long] - off[short])), model.image(short).name, model.image(long).name]
-
-
-def _some_points(model: pycolmap.Reconstruction) -> list[int]:
-    """Ids of points in three photographs or more, the longest tracks first, until each photograph has enough."""
-    counts: Counter[int] = Counter()
-    chosen = []
-    for number, point in sorted(model.points3D.items(), key=lambda item: -item[1].track.length()):
-        seen = {element.image_id for element in point.track.elements}
-        if len(seen) > 2 and min(counts[image] for image in seen) < _POINTS:
-            chosen.append(number)
-            counts.update(seen)
-    return chosen
-
-
-def _adjusted(
-    model: pycolmap.Reconstruction, images: list[pycolmap.Image], points: list[int], own: bool
-) -> tuple[float, dict[int, float], int]:
-    """Adjust cameras to some points, with an ``own`` focal length of each image or one for each camera.
-
-    Returns the cost, the focal lengths by the images' ids, and the degrees of freedom that are left.
-    """
-    copy, seen = pycolmap.Reconstruction(), {image.image_id: [] for image in images}
-    for number in points:
-        for element in model.point3D(number).track.elements:
-            seen[element.image_id].append((number, model.image(element.image_id).points2D[element.point2D_idx].xy))
-    tracks: dict[int, list[pycolmap.TrackElement]] = {number: [] for number in points}
-    for image in images:
-        camera = pycolmap.Camera(model.camera(image.camera_id).todict())
-        camera.camera_id = image.image_id if own else image.camera_id
-        if not copy.exists_camera(camera.camera_id):
-            copy.add_camera_with_trivial_rig(camera)
-        keypoints = np.array([xy for _, xy in seen[image.image_id]]).reshape(-1, 2)
-        copied = pycolmap.Image(image.name, keypoints, camera_id=camera.camera_id, image_id=image.image_id)
-        copy.add_image_with_trivial_frame(copied, image.cam_from_world())
-        for k, (number, _) in enumerate(seen[image.image_id]):
-            tracks[number].append(pycolmap.TrackElement(image.image_id, k))
-    for number, track in tracks.items():
-        copy.add_point3D(model.point3D(number).xyz, pycolmap.Track(track))
-    options = pycolmap.BundleAdjustmentOptions(refine_extra_params=False, print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.solver_options.max_num_iterations = 15
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in images:
-        if seen[image.image_id]:
-            config.add_image(image.image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_bundle_adjuster(options, config, copy).solve()
-    focal = {image.image_id: copy.camera(copy.image(image.image_id).camera_id).mean_focal_length() for image in images}
-    freedom = 2 * copy.compute_num_observations() - 3 * len(points) - 6 * len(images) - copy.num_cameras()
-    cost = summary.ceres_summary.final_cost  # pyright: ignore[reportAttributeAccessIssue]  Ceres is the default
-    return cost, focal, freedom
 
 
 def _shared_lenses(model: pycolmap.Reconstruction) -> list[dict]:
