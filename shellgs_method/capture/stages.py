@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import combinations, groupby
@@ -292,6 +292,9 @@ class _Capture:
                 shutil.copytree(self.work.folder / "coarse", folder, dirs_exist_ok=True)
             if self.rig and models:
                 models = self._mounted(database, folder)
+            for lens in (lens for model in models for lens in model.get("lenses", [])):
+                lens["names"].sort(key=along_the_walk)
+                lens["exif"] = focal_length_of_exif(self.folder / lens["names"][0])
             found = {"photographs": self.names, "models": models, "apart": apart, "matching": matching}
             found["flat_pairs"] = _flat_pairs(database)
             (folder / "models.json").write_text(json.dumps(found))
@@ -434,25 +437,12 @@ class _Capture:
             )
         else:
             for lens in lenses:
-                self._tell_of_a_doubtful_lens(sorted(lens["names"], key=along_the_walk), *lens["focal"])
+                _tell_of_a_doubtful_lens(**lens)
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:
                 only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
                 self._tell_of_a_pass_apart(only, found.get("apart", []))
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
-
-    def _tell_of_a_doubtful_lens(self, names: list[str], across: float, down: float) -> None:
-        """Tell of a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
-        exif = focal_length_of_exif(self.folder / names[0])
-        is_other = exif is not None and not 1 / _OFF_EXIF < (across + down) / 2 / exif < _OFF_EXIF
-        if is_other or max(across, down) > _OFF_SQUARE * min(across, down):
-            said = f", in EXIF {exif:.0f}" if exif else ""
-            notice(
-                f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} "
-                f"pixels across and {down:.0f} down were found{said}. If they were not cropped, stretched or "
-                "stabilised, they do not tell it, as where all look straight at one plane, or ahead along a street, "
-                "and depths are off by as much: take some from the side, at angles to the wall."
-            )
 
     def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
         if not names:
@@ -507,6 +497,20 @@ class _Capture:
         log = self.work.folder / "colmap.log"
         return run_step(
             step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
+        )
+
+
+def _tell_of_a_doubtful_lens(names: list[str], focal: Sequence[float], exif: float | None) -> None:
+    """Tell of a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
+    across, down = focal
+    is_other = exif is not None and not 1 / _OFF_EXIF < (across + down) / 2 / exif < _OFF_EXIF
+    if is_other or max(across, down) > _OFF_SQUARE * min(across, down):
+        said = f", in EXIF {exif:.0f}" if exif else ""
+        notice(
+            f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} "
+            f"pixels across and {down:.0f} down were found{said}. If they were not cropped, stretched or "
+            "stabilised, they do not tell it, as where all look straight at one plane, or ahead along a street, "
+            "and depths are off by as much: take some from the side, at angles to the wall."
         )
 
 
