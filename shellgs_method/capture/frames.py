@@ -199,6 +199,8 @@ def sharpest(sharpnesses: Float[np.ndarray, " N"], progress: Float[np.ndarray, "
 def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStream]]:
     try:
         with av.open(str(video)) as container:
+            if container.format.name == "tty":  # FFmpeg draws what is written, as a film
+                raise av.error.InvalidDataError(0, "it is text")
             stream = _main_stream(video, container.streams.video)
             stream.thread_type = "AUTO"
             yield container, stream

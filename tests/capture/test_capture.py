@@ -483,11 +483,13 @@ def test_frames_of_a_video_whose_pixels_are_not_square_are_as_wide_as_they_are_s
     assert sizes == {(128, 72)}
 
 
-@pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
-def test_a_file_that_is_no_video_is_refused_by_name(tmp_path, content):
-    (tmp_path / "walk.mp4").write_bytes(content)
-    with pytest.raises(SceneError, match=r"walk\.mp4 cannot be read as a video"):
-        capture(tmp_path / "walk.mp4", tmp_path / "scene")
+@pytest.mark.parametrize(
+    ("name", "content"), [("walk.mp4", b""), ("walk.mp4", b"this is no video" * 100), ("picks.txt", b"1 2 3\n" * 100)]
+)
+def test_a_file_that_is_no_video_is_refused_by_name(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SceneError, match=rf"{name} cannot be read as a video"):
+        capture(tmp_path / name, tmp_path / "scene")
     assert not (tmp_path / "scene" / "images").exists()
 
 
