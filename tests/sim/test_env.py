@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pickle
 import shutil
 from pathlib import Path
@@ -571,6 +572,18 @@ def test_a_folder_that_cannot_be_used_gets_one_sentence(folder, tmp_path, spoil,
     spoil(out)
     with pytest.raises(SceneError, match=says):
         make(out)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="not on Windows")
+def test_a_forked_process_does_not_wait_for_threads_that_it_has_not():
+    """With more than one it would: gymnasium's asynchronous form forks, and its first image never came."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            assert pool.apply_async(torch.get_num_threads).get(timeout=60) == 1
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_the_vectorised_form_steps_all(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,6 +28,10 @@ UNSET = 0.5, 0.5, 0.5, 1.0
 """Colour of a geom in MuJoCo that has none of its own."""
 AMBIENT = 0.5
 """Share of the light on what moves that is from everywhere."""
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # A forked process, as of gymnasium's vectorised form, has none of OpenMP's threads, and would wait for them.
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def cast_at_moving(
