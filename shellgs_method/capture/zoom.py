@@ -11,9 +11,10 @@ import numpy as np
 import pycolmap
 
 _POINTS = 80  # of a photograph, by which its own focal length is found
-# F, and deviation of focal lengths, at which photographs have not one camera. Right models have 7 and less, but one of
-# 30 at a deviation of 0.02; videos with frames cropped by a tenth, a zoom or two lenses 39 and 0.07 and more.
-_ZOOMED = 20.0, 0.03
+# F, deviation of focal lengths, and ratio of costs at which photographs have not one camera. Right models have an F of
+# 7 and less, but one of 30 at a deviation of 0.02, and one taken straight down 63 and 0.08 at a ratio of 1.16; videos
+# with frames cropped by a tenth, a zoom or two lenses 39, 0.07 and 1.27, and more.
+_ZOOMED = 20.0, 0.03, 1.2
 
 
 def zoomed(model: pycolmap.Reconstruction, images: list[pycolmap.Image], least: int) -> list | None:
@@ -35,8 +36,9 @@ def zoomed(model: pycolmap.Reconstruction, images: list[pycolmap.Image], least: 
     (together, _, _), (apart, focal, freedom) = (_adjusted(model, images, points, own=own) for own in (False, True))
     logs = {k: np.log([focal[i] for i in known if model.image(i).camera_id == k]) for k in used}
     off = {i: np.log(focal[i]) - np.median(logs[model.image(i).camera_id]) for i in known}
-    least_f, least_deviation = _ZOOMED
+    least_f, least_deviation, least_ratio = _ZOOMED
     is_better = (together - apart) * max(1, freedom) > least_f * apart * (len(images) - len(used))
+    is_better &= together > least_ratio * apart
     deviation = np.subtract(*np.quantile(list(off.values()), [0.84, 0.16])) / 2
     if not is_better or not deviation > least_deviation:
         return None
