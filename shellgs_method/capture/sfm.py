@@ -38,6 +38,7 @@ _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
 _FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
 _CREDIBLE = 0.3, 10.0  # widths that EXIF may say, 11 to 360 mm on 35 mm film; 4 times the true one does no harm
 _NEAR = 10  # photographs, within which they are neighbours along a walk
+_LARGE = 1300  # pixels of photographs that need no doubled image; of 29 of 1024 pixels along a street, all did
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 _LEAST_POINTS = 10  # of a photograph with a camera: 17 and more of right ones, incremental mapping places none by 30
 
@@ -63,7 +64,7 @@ def extract(
             are taken at once, and the rotation from the first camera.
         masks: folder of masks, ``<name>.png``, black where no features are wanted; white ones are added for photographs
             without one, which COLMAP would leave out.
-        sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
+        sift: maximum image size, number of features, and first octave for large photographs: 0 skips
             the doubled image, which smaller photographs need.
         contrasts: contrast of each photograph relative to one by day: features of COLMAP have a least contrast, and at
             a fifth of the light one in 25 was left.
@@ -86,7 +87,7 @@ def extract(
                 reader.existing_camera_id = camera
             options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
             options.sift.max_num_features = sift["max_num_features"]
-            options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
+            options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= _LARGE else -1
             options.sift.peak_threshold *= contrast
             pycolmap.extract_features(
                 database,
