@@ -28,8 +28,8 @@ _SURE = 2.5
 """Difference of the logarithms of two likelihoods from which the one is doubted: twelve times as likely."""
 
 
-def unit_doubted(validation: Validation, mesh: ShellMesh, views: Sequence[View]) -> str | None:
-    """A sentence that asks for the shell's unit of length if another one is more likely; None if not."""
+def unit_in_words(validation: Validation, mesh: ShellMesh, views: Sequence[View]) -> str | None:
+    """How large people and storeys are by the shell's unit, and whether another one is more likely; None if unknown."""
     alignment = validation.alignment
     distances = [support.distance for support in validation.views if len(support.hits)]
     if not distances or alignment.up is None:
@@ -41,7 +41,9 @@ def unit_doubted(validation: Validation, mesh: ShellMesh, views: Sequence[View])
     eye = float(np.median(metres * (eyes - mesh.centre) @ alignment.up) - foot)
     storeys = [scan.period for scan in validation.scans if scan.name == "upwards" and scan.period]
     lengths = dict(zip(_USUAL, (float(np.median(distances)), float(top - foot), eye, *storeys), strict=False))
-    return doubted({words: length for words, length in lengths.items() if length > 0}, metres)
+    known = {words: length for words, length in lengths.items() if length > 0}
+    unit = f"the {_UNITS[metres]}" if metres in _UNITS else f"{metres:g} m"
+    return doubted(known, metres) or f"With {unit} as the shell's unit, {_in_words(known)}."
 
 
 def doubted(lengths: Mapping[str, float], metres_per_unit: float) -> str | None:
@@ -50,14 +52,15 @@ def doubted(lengths: Mapping[str, float], metres_per_unit: float) -> str | None:
     best = min(likely, key=lambda unit: likely[unit])
     if metres_per_unit not in likely or likely[metres_per_unit] < likely[best] + _SURE:
         return None
-    now, then = (
-        ", ".join(words.format(length * unit / metres_per_unit) for words, length in lengths.items())
-        for unit in (metres_per_unit, best)
-    )
+    then = {words: length * best / metres_per_unit for words, length in lengths.items()}
     return (
-        f"Is the shell's unit the {_UNITS[best]}, not the {_UNITS[metres_per_unit]}? Now {now}; with "
-        f"--metres-per-shell-unit {best:g} {then}. It was left as it is."
+        f"Is the shell's unit the {_UNITS[best]}, not the {_UNITS[metres_per_unit]}? Now {_in_words(lengths)}; with "
+        f"--metres-per-shell-unit {best:g} {_in_words(then)}. It was left as it is."
     )
+
+
+def _in_words(lengths: Mapping[str, float]) -> str:
+    return ", ".join(words.format(length) for words, length in lengths.items())
 
 
 def _unlikely(lengths: Sequence[float], words: Sequence[str]) -> float:

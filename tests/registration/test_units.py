@@ -15,7 +15,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.repetition import ShiftScan
 from shellgs_method.registration.support import ViewSupport
-from shellgs_method.registration.units import doubted, unit_doubted
+from shellgs_method.registration.units import doubted, unit_in_words
 from shellgs_method.registration.validation import Validation
 from shellgs_method.shell import Alignment, ShellMesh
 
@@ -77,13 +77,16 @@ def test_lengths_of_a_shell_in_its_place_are_doubted():
     alignment = Alignment(placed, ("house.ply",), foot, up=np.array([0.0, 0, 1]))
     validation = Validation(alignment, [], supports, scans=scans)
     lengths = {word: length * foot for word, length in zip(WORDS, (14, 12, 1.6, 3.3), strict=True)}
-    said = unit_doubted(validation, mesh, views)
+    said = unit_in_words(validation, mesh, views)
     assert said is not None
     assert "the metre, not the foot" in said
     assert said == doubted(lengths, foot)
     del lengths[WORDS[2]]
     above = ShellMesh(mesh.vertices + np.array([0, 0, 10]), mesh.faces)  # eyes below the lower edge tell nothing
-    assert unit_doubted(validation, above, views) == doubted(lengths, foot)
+    assert unit_in_words(validation, above, views) == doubted(lengths, foot)
     assert doubted(lengths, 0.5) is None  # a unit without a name
-    assert unit_doubted(replace(validation, views=supports[1:]), mesh, views) is None
-    assert unit_doubted(replace(validation, alignment=replace(alignment, up=None)), mesh, views) is None
+    halved = replace(validation, alignment=replace(alignment, metres_per_shell_unit=0.5))
+    said = "With 0.5 m as the shell's unit, cameras stand 4.27 m from it, it is 6 m high, cameras are"
+    assert str(unit_in_words(halved, mesh, views)).startswith(said)
+    assert unit_in_words(replace(validation, views=supports[1:]), mesh, views) is None
+    assert unit_in_words(replace(validation, alignment=replace(alignment, up=None)), mesh, views) is None
