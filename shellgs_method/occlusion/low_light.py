@@ -43,11 +43,12 @@ class LowLight:
     @classmethod
     def of(cls, views: Collection[ShellView]) -> LowLight:
         """Measure the photographs, at their mean exposure."""
-        greys = [view.image.float().mean(dim=-1) for view in views if (view.depth > 0).any()]
-        shown = [view.depth > 0 for view in views if (view.depth > 0).any()]
-        if not greys:
+        showing = [view for view in views if (view.depth > 0).any()]
+        if not showing:
             return cls(1.0, False)
-        bright = float(np.median([float(grey[on].median()) for grey, on in zip(greys, shown, strict=True)]))
+        greys = [view.image.float().mean(dim=-1) for view in showing]
+        medians = [float(grey[view.depth > 0].median()) for grey, view in zip(greys, showing, strict=True)]
+        bright = float(np.median(medians))
         scale = max(1.0, (DARK - 255 * BLACK) / (bright - 255 * BLACK))
         return cls(scale, scale * float(np.median([noise(grey.numpy()) for grey in greys])) > NOISY)
 
