@@ -576,12 +576,14 @@ def test_copies_of_a_photograph_are_left_out_and_told(tmp_path, caplog):
     assert "IMG_1 copy.jpg is IMG_1.jpg" in caplog.text
 
 
-def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog):
-    """As those in nerfstudio's images_2 and images_4; other photographs of the same names are no copies."""
+@pytest.mark.parametrize("light", [1.0, 0.2])
+def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog, light):
+    """As those in nerfstudio's images_2 and images_4; others of the same names are no copies, at night either."""
     for k in range(3):
         for scale, name in {1: "images", 2: "images_2", 4: "images_4", 3: "others"}.items():
             (tmp_path / name).mkdir(exist_ok=True)
             shown = photograph(40, 30, seed=k if name != "others" else k + 9).resize((641, 480))
+            shown = shown.point(lambda level: light * level)
             shown.resize((641 // scale, 480 // scale)).save(tmp_path / name / f"{k}.jpg")
     (tmp_path / "images_2" / "0.jpg").write_bytes(b"damaged")
     found = [*(f"images/{k}.jpg" for k in range(3)), "images_2/0.jpg", *(f"others/{k}.jpg" for k in range(3))]
