@@ -112,7 +112,7 @@ def _measured(
         step = usual if frame.time is None or last is None else frame.time - last
         # Times begin anew where files were joined, and jump after a break.
         times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
-        last, end = frame.time, max(end, frame.time or 0.0)
+        last, end = frame.time, max(end, (frame.time or 0.0) + max(usual, frame.duration * (frame.time_base or 0)))
         if not marks or times[-1] >= marks[-1] + _PACE:
             height = max(1, round(_SMALL * frame.height / frame.width))
             small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
@@ -122,7 +122,7 @@ def _measured(
         progress.update(task, completed=len(times))
     if brightest is None:
         raise SceneError(f"{video} holds no frames: is it a complete video?")
-    _tell_of_a_cut(video, stream, end + usual)
+    _tell_of_a_cut(video, stream, float(end))
     since = np.array(times)
     moved = np.interp(since, marks, travelled(np.array(shifts)))
     return _Measured(np.array(sharpnesses), since, moved, brightest)

@@ -122,16 +122,17 @@ def test_a_damaged_packet_of_a_video_is_left_out_and_this_is_told(tmp_path, capl
     assert "walk.mp4 is damaged, and is left out" in caplog.text
 
 
-@pytest.mark.parametrize(("share", "told"), [(0.5, True), (1.0, False)])
-def test_a_video_that_was_cut_off_is_told(tmp_path, caplog, share, told):
-    """As a download of which the rest is missing, behind a header of all its frames."""
+@pytest.mark.parametrize(("share", "still", "told"), [(0.5, 1, True), (1.0, 1, False), (1.0, 20, False)])
+def test_a_video_that_was_cut_off_is_told(tmp_path, caplog, share, still, told):
+    """As a download of which the rest is missing, behind a header of all its frames; not one that stands at its end."""
     path, wide = tmp_path / "walk.mp4", photograph(480, 96)
     with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
-        frames = [av.VideoFrame.from_image(wide.crop((8 * k, 0, 8 * k + 160, 96))) for k in range(40)]
-        for frame in [*frames, None]:
-            container.mux(stream.encode(frame))
+        frames = [av.VideoFrame.from_image(wide.crop((8 * k, 0, 8 * k + 160, 96))) for k in range(41 - still)]
+        packets = [packet for frame in [*frames, None] for packet in stream.encode(frame)]
+        packets[-1].duration = still
+        container.mux(packets)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     (tmp_path / "frames").mkdir()
     extract_frames(path, tmp_path / "frames", 10, QUIET)
