@@ -1229,29 +1229,6 @@ def test_a_zoom_among_photographs_of_one_camera_is_noticed():
     assert long in names[8:]
 
 
-_STRAY = """
-import json, sys
-sys.path.insert(0, sys.argv[1])
-import sfm  # first: it imports what must come before pycolmap
-import pycolmap
-
-model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=5, num_points3D=50))
-first = model.reg_image_ids()[0]
-seen = [k for k, point in enumerate(model.image(first).points2D) if point.has_point3D()]
-for k in seen[int(sys.argv[2]) :]:
-    model.delete_observation(first, k)
-print(json.dumps([model.num_reg_images(), first in sfm._placed(model).reg_image_ids(), model.num_reg_images()]))
-"""
-
-
-@pytest.mark.parametrize(("points", "placed"), [(9, False), (10, True)])
-def test_a_photograph_of_a_few_points_has_no_camera(points, placed):
-    """Global mapping leaves it anywhere."""
-    command = [sys.executable, "-c", _STRAY, Path(stages.__file__).parent, str(points)]
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    assert json.loads(printed.splitlines()[-1]) == [5, placed, 4 + placed]
-
-
 def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
     (tmp_path / "photographs").mkdir()
     for k in range(8):
