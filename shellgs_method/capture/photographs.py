@@ -431,12 +431,15 @@ def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:
 def focal_length_of_exif(photograph: Path) -> float | None:
     """Focal length in pixels by that on 35 mm film, whose diagonal has 43.3 mm; None if a photograph does not say it.
 
-    Others that EXIF may say are of the pixels that it had before it was made smaller.
+    Others that EXIF may say are of the pixels that it had before it was made smaller, and that of a digital zoom is of
+    the lens or of what is left of its picture.
     """
     with Image.open(photograph) as image:
-        said, diagonal = tags_of(image).get(ExifTags.Base.FocalLengthIn35mmFilm), np.hypot(*image.size)
+        tags, diagonal = tags_of(image), np.hypot(*image.size)
+    if _digital_zoom(tags) > 1:
+        return None
     try:
-        film = float(said or 0)
+        film = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
     except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
         return None
     return film * diagonal / np.hypot(36, 24) if 0 < film < np.inf else None

@@ -1247,24 +1247,25 @@ def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
 
 
 @pytest.mark.parametrize(
-    ("film", "found", "told"),
+    ("film", "zoom", "found", "told"),
     [
-        (26, [48, 48], ""),
-        (26, [41, 41], ""),
-        (26, [39, 39], "39 pixels across and 39 down were found, in EXIF 48."),
-        (26, [58, 58], "58 pixels across and 58 down were found, in EXIF 48."),
-        (None, [58, 58], ""),
-        (0, [58, 58], ""),
-        (None, [100, 102], ""),
-        (None, [100, 104], "100 pixels across and 104 down were found."),
+        (26, None, [48, 48], ""),
+        (26, None, [41, 41], ""),
+        (26, None, [39, 39], "39 pixels across and 39 down were found, in EXIF 48."),
+        (26, 1.0, [58, 58], "58 pixels across and 58 down were found, in EXIF 48."),
+        (26, 2.0, [96, 96], ""),  # as some write the lens's, others that times the zoom
+        (None, None, [58, 58], ""),
+        (0, None, [58, 58], ""),
+        (None, None, [100, 102], ""),
+        (None, None, [100, 104], "100 pixels across and 104 down were found."),
     ],
 )
-def test_a_focal_length_that_no_such_camera_has_is_told(tmp_path, monkeypatch, caplog, film, found, told):
+def test_a_focal_length_that_no_such_camera_has_is_told(tmp_path, monkeypatch, caplog, film, zoom, found, told):
     """Along a street pixels were 6 % wider than high, and straight down on trees all was 24 % too far away."""
     exif = Image.Exif()
     exif[ExifTags.Base.Model] = "phone"
-    if film is not None:
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = film
+    said = {ExifTags.Base.FocalLengthIn35mmFilm: film, ExifTags.Base.DigitalZoomRatio: zoom}
+    exif.get_ifd(ExifTags.IFD.Exif).update({tag: value for tag, value in said.items() if value is not None})
     (tmp_path / "photographs").mkdir()
     names = [f"{k}.jpg" for k in range(3)]
     for name in names:
