@@ -38,7 +38,7 @@ _WIDTHS = re.compile(rb"GPano:(?:FullPano|CroppedAreaImage)WidthPixels\s*(?:=\s*
 _CLOSED = 3.0
 _NOISE = 1.0  # of colours
 _SWEPT = 6  # EXIF's CustomRendered of a panorama, as Apple writes it
-_WIDE = 2.5  # times as wide as high, or as high as wide: more than of any camera
+_WIDE = 2.5  # times as long as the other side: more than of any camera
 _PLAIN = 4.0  # deviation of the colours of a column that shows nothing, as of a black border: sky and ground are apart
 _DARK, _SMALL = 24, 64  # levels of what lies around the circle of a fisheye lens; pixels of its image's side
 _COMPARED = 9  # photographs
@@ -151,8 +151,9 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     sizes = {name: _size(folder / name) for name in names if name not in said}
     if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
         notice(
-            f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, are more than {_WIDE:g} times as wide as "
-            "high: if they are panoramas, no camera fits them, and others are bent to them: leave them out."
+            f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, have one side {_WIDE:g} times as "
+            "long as the other, or more: if they are panoramas, no camera fits them, and others are bent to them: "
+            "leave them out."
         )
     twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
     found = set(said)

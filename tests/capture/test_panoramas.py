@@ -148,7 +148,7 @@ def test_photographs_wider_than_cameras_take_them_are_told(tmp_path, caplog):
     for name, size in {"wide": (300, 100), "high": (100, 300), "cinema": (240, 100)}.items():
         photograph(*size).save(tmp_path / f"{name}.png")
     assert not find_panoramas(tmp_path, ["cinema.png", "high.png", "wide.png"], set())
-    assert "2 photographs of 3, high.png for example, are more than 2.5 times as wide as high" in caplog.text
+    assert "2 photographs of 3, high.png for example, have one side 2.5 times as long as the other" in caplog.text
 
 
 def test_what_says_nothing_is_a_panorama_if_it_goes_around_and_this_is_told(tmp_path, caplog):
