@@ -64,8 +64,8 @@ def extract(
             are taken at once, and the rotation from the first camera.
         masks: folder of masks, ``<name>.png``, black where no features are wanted; white ones are added for photographs
             without one, which COLMAP would leave out.
-        sift: maximum image size, number of features, and first octave for large photographs: 0 skips
-            the doubled image, which smaller photographs need.
+        sift: maximum image size, number of features, and first octave for large photographs: 0 skips the doubled image,
+            which smaller photographs need.
         contrasts: contrast of each photograph relative to one by day: features of COLMAP have a least contrast, and at
             a fifth of the light one in 25 was left.
         camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
@@ -98,10 +98,9 @@ def extract(
                 extraction_options=options,
             )
     with pycolmap.Database.open(database) as opened:
-        read = {image.name for image in opened.read_all_images()}
-        if unread := [name for lens in lenses for name in lens["names"] if name not in read]:
-            raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
         used = {image.name: image.camera_id for image in opened.read_all_images()}
+        if unread := [name for lens in lenses for name in lens["names"] if name not in used]:
+            raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
         shrunk = {used[lens["names"][0]]: lens["shrunk"] for lens in lenses if lens.get("shrunk")}
         for camera in opened.read_all_cameras():
             if focal := shrunk.get(camera.camera_id):
