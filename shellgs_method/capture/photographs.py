@@ -50,7 +50,7 @@ _LENS_TAGS = (
 )
 
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
-_IN_ORDER = 0.5  # of the steps from one photograph to the next, that are between neighbours by name
+_IN_ORDER = 0.5  # of the steps from one name to the next, that are between neighbours by time
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
 # at most, at a tenth of the light, others 0.28 and more.
 _SMALL, _ALIKE = 32, 0.15
@@ -468,15 +468,16 @@ def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> N
         names: their names, in the order in which neighbours are matched.
         overlap: how many after each of them are.
     """
-    walks: dict[tuple, list[tuple[str, str, int]]] = {}  # of each folder and camera: times, and places by name
+    walks: dict[tuple, list[tuple[str, str]]] = {}  # times, of each folder and camera
     for name in names:
         with Image.open(folder / name) as image:
             tags = tags_of(image)
         when, fraction, *camera = (str(tags.get(tag, "")).strip() for tag in (*_MOMENT, *_LENS_TAGS[:2]))
         if when:
-            walk = walks.setdefault((name.rpartition("/")[0], *camera), [])
-            walk.append((when, fraction, len(walk)))
-    steps = [abs(a[2] - b[2]) for walk in walks.values() for a, b in pairwise(sorted(walk))]
+            walks.setdefault((name.rpartition("/")[0], *camera), []).append((when, fraction))
+    places = [np.argsort(sorted(range(len(walk)), key=walk.__getitem__)) for walk in walks.values()]
+    # From name to name, not from time to time: two phones of one kind take turns, and are each in order.
+    steps = [abs(a - b) for place in places for a, b in pairwise(place)]
     if sum(step <= overlap for step in steps) < _IN_ORDER * len(steps):
         notice(
             f"The names of the photographs, {names[0]} for example, do not follow the order in which they were taken, "
