@@ -80,12 +80,14 @@ class ShellView:
         image: photograph at that size, at the mean exposure of all.
         depth: z-depth of the shell in scene units, 0 where there is none, or where the photograph does not count.
         kept: pixels of the photograph that count; None for all.
+        noise: standard deviation of its noise, of 255, where that is large.
     """
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"]
     kept: Bool[Tensor, "h w"] | None = None
+    noise: float = 0.0
 
     @cached_property
     def silhouette(self) -> Bool[Tensor, "h w"]:
@@ -219,10 +221,10 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
 
 
 def _plain(view: ShellView) -> Bool[Tensor, "h w"]:
-    """Pixels around which brightness hardly varies, relative to its mean."""
+    """Pixels around which brightness hardly varies but for noise, relative to its mean."""
     grey = view.image.float().mean(dim=-1).numpy()
     mean, squares = (uniform_filter(each, _WINDOW, mode="nearest") for each in (grey, grey**2))
-    return torch.from_numpy(squares - mean**2 < (_PLAIN * mean) ** 2)
+    return torch.from_numpy(squares - mean**2 < (_PLAIN * mean) ** 2 + view.noise**2)
 
 
 def _sides_of(pixels: _Pixels, others: Sequence[ShellView]) -> Sides:

@@ -7,6 +7,7 @@ the rest are doubted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -34,32 +35,39 @@ class LowLight:
 
     Attributes:
         scale: of the colours about black; 1 by day.
-        is_noisy: whether there is much noise then.
+        noise: standard deviation of the noise of their mean colour then, of 255.
     """
 
     scale: float
-    is_noisy: bool
+    noise: float
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether there is much noise."""
+        return self.noise > NOISY
 
     @classmethod
     def of(cls, views: Collection[ShellView]) -> LowLight:
         """Measure the photographs, at their mean exposure."""
         showing = [view for view in views if (view.depth > 0).any()]
         if not showing:
-            return cls(1.0, False)
+            return cls(1.0, 0.0)
         greys = [view.image.float().mean(dim=-1) for view in showing]
         medians = [float(grey[view.depth > 0].median()) for grey, view in zip(greys, showing, strict=True)]
         bright = float(np.median(medians))
         scale = max(1.0, (DARK - 255 * BLACK) / (bright - 255 * BLACK))
-        return cls(scale, scale * float(np.median([noise(grey.numpy()) for grey in greys])) > NOISY)
+        return cls(scale, scale * float(np.median([noise(grey.numpy()) for grey in greys])))
 
     def comparable(self, view: ShellView) -> ShellView:
         """A view whose photograph can be compared."""
         image = view.image.numpy()
         if self.scale > 1:
             image = (self.scale * (image - 255 * BLACK) + 255 * BLACK).round().clip(0, 255).astype(np.uint8)
+        left = 0.0
         if self.is_noisy:
             image = cv2.GaussianBlur(image, (0, 0), BLUR)
-        return replace(view, image=torch.from_numpy(image))
+            left = self.noise / (2 * math.sqrt(math.pi) * BLUR)  # the norm of the blur's weights
+        return replace(view, image=torch.from_numpy(image), noise=left)
 
 
 def noise(grey: Float[np.ndarray, "H W"]) -> float:

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -55,7 +56,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
-from shellgs_method.occlusion.low_light import DARK, LowLight, noise
+from shellgs_method.occlusion.low_light import BLUR, DARK, LowLight, noise
 from shellgs_method.occlusion.verdicts import Verdicts
 from shellgs_method.viewer import ContradictedShell
 
@@ -171,6 +172,10 @@ def test_a_post_is_found_in_photographs_of_little_light(brightness: float, sigma
     dark, before = at_night([view for view, _ in views], brightness, sigma), views[MIDDLE][1]
     light = LowLight.of(dark)
     assert light.is_noisy == (sigma > 0)
+    assert light.noise == pytest.approx(light.scale * sigma / 3**0.5, rel=0.1, abs=2)
+    flat = np.random.default_rng(0).normal(0, light.noise, (400, 400)).astype(np.float32)
+    left = cv2.GaussianBlur(flat, (0, 0), BLUR).std() if light.is_noisy else 0.0
+    assert light.comparable(dark[0]).noise == pytest.approx(left, rel=0.05)
 
     def found(views: list[ShellView]) -> float:
         contradicted = scores(views)[1].numpy() > CONTRADICTED
@@ -190,13 +195,14 @@ def test_photographs_by_day_are_compared_as_they_are_and_dark_ones_with_more_exp
     ]
     light = LowLight.of(dark)
     assert light.scale > 1.5
+    assert light.comparable(dark[0]).noise == 0
     for view, raised in zip(dark, map(light.comparable, dark), strict=True):
         expected = exposed(view.image / 255, torch.tensor(np.log(light.scale) / POWER))
         assert torch.equal(raised.image, (255 * expected).round().clamp(0, 255).byte())
     medians = [float(light.comparable(view).image.float().mean(dim=-1).median()) for view in dark]
     assert np.median(medians) == pytest.approx(DARK, abs=1)
     nowhere = [replace(view, depth=torch.zeros_like(view.depth)) for view in dark]
-    assert LowLight.of(nowhere) == LowLight(1.0, False)
+    assert LowLight.of(nowhere) == LowLight(1.0, 0.0)
 
 
 def test_noise_is_measured_beside_slopes_and_edges():
@@ -253,10 +259,16 @@ def test_what_a_mirror_shows_is_found_behind_the_wall(error: float):
 
 
 def test_what_hardly_varies_shows_nothing_behind_the_shell():
-    """A plain wall, as its photographs agree with one another at any depth."""
+    """A plain wall, as its photographs agree with one another at any depth; also one of noise alone."""
     views = [view for view, _ in street(CAMERAS, mirror=1 / 0.6)]
     plain = replace(views[MIDDLE], image=(190 + 0.1 * (views[MIDDLE].image - 190.0)).byte())
     assert (behind([*views[:MIDDLE], plain, *views[MIDDLE + 1 :]], 0.1).score == -1).all()
+    grain = torch.from_numpy(np.random.default_rng(0).normal(0, 40, (HEIGHT, WIDTH, 1)))
+    noisy = replace(plain, image=(plain.image + grain).clamp(0, 255).byte())
+    looked_at = (behind([*views[:MIDDLE], noisy, *views[MIDDLE + 1 :]], 0.1).score > -1).float().mean()
+    assert looked_at > 0.8
+    known = replace(noisy, noise=40.0)
+    assert (behind([*views[:MIDDLE], known, *views[MIDDLE + 1 :]], 0.1).score > -1).float().mean() < 0.4
 
 
 def test_a_view_that_shows_no_shell_has_nothing_before_or_behind_it_in_a_scene_of_any_unit():
