@@ -439,6 +439,13 @@ def test_what_a_robot_brings_or_lacks_is_refused(folder, tmp_path, old, new, say
         make(folder, robot=tmp_path / "ball.xml")
 
 
+def test_a_robot_whose_file_is_not_utf_8_is_refused(folder, tmp_path):
+    """MuJoCo reads it, and fails at the first name that it is asked for."""
+    (tmp_path / "ball.xml").write_bytes(ROBOT.replace('<camera name="', '<camera name="é').encode("latin-1"))
+    with pytest.raises(SceneError, match=r"ball\.xml is not written in UTF-8"):
+        make(folder, robot=tmp_path / "ball.xml")
+
+
 @pytest.mark.parametrize(("own", "used"), [("0.0005", 0.0005), ("0.003", 0.02 / 7), ("0.1", 0.02)])
 def test_a_robot_moves_by_the_time_step_and_the_contacts_of_its_file(folder, tmp_path, own, used):
     flags = '<flag contact="disable" constraint="disable"/>'  # of a robot that was alone

@@ -33,7 +33,11 @@ def read_spec(path: Path):
     """Read a model into MuJoCo's editable form; its files are found from any working directory."""
     mujoco = import_mujoco()
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        path.read_text("utf-8")  # names are decoded when they are asked for
+        return spec
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path} is not written in UTF-8, which MuJoCo's names are: save it so") from error
     except (ValueError, OSError) as error:
         raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
 
