@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import inside
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.lens import COEFFICIENTS, Lens
+from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")  # the same by the name of other programs
@@ -103,8 +103,9 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
             f"{angle:.0f}°: give them in pixels, not in millimetres or as a share of the width"
         )
     distortion = tuple(number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
-    if not fisheye and distortion[3] != 0:
-        raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
+    for key in OTHER_COEFFICIENTS if fisheye else ("k4", *OTHER_COEFFICIENTS):
+        if key in lens and number(lens, key, where) != 0:
+            raise SceneError(f"{where} has the coefficient {key}, which nerfstudio cannot undistort; {UNDISTORT}")
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
     distorts = fisheye or any(distortion)

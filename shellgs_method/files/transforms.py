@@ -20,7 +20,7 @@ from shellgs_method.files.readers.ply import ply_points, read_ply
 from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import OPENGL
-from shellgs_method.geometry.lens import COEFFICIENTS, Lens
+from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
 
 NAME = "transforms.json"
 GREY = 128
@@ -214,7 +214,7 @@ def _lens(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
     listed = source.get("distortion_params")
     if listed is None:
-        return {key: source[key] for key in COEFFICIENTS if key in source}
+        return {key: source[key] for key in (*COEFFICIENTS, *OTHER_COEFFICIENTS) if key in source}
     if not isinstance(listed, list) or len(listed) != len(COEFFICIENTS):
         raise SceneError(f"{where}: distortion_params are {', '.join(COEFFICIENTS)}, not {str(listed)[:40]}")
     return dict(zip(COEFFICIENTS, listed, strict=True))

@@ -8,6 +8,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+OTHER_COEFFICIENTS = ("k5", "k6", "s1", "s2", "s3", "s4")
+"""Coefficients of OpenCV's rational model and of a thin prism, which nerfstudio does not know."""
 
 
 @dataclass(frozen=True)

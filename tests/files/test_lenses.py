@@ -137,9 +137,14 @@ def test_a_lens_that_folds_the_photograph_is_refused(scene: Path, model: str, co
         with_lens(scene, model, coefficients)
 
 
-def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
-    with pytest.raises(SceneError, match=r"k4, which nerfstudio cannot undistort"):
-        with_lens(scene, "OPENCV", BROWN | {"k4": 0.01})
+@pytest.mark.parametrize(
+    ("model", "coefficient"), [("OPENCV", "k4"), ("OPENCV", "k6"), ("OPENCV", "s1"), ("OPENCV_FISHEYE", "k5")]
+)
+def test_a_coefficient_unknown_to_nerfstudio_is_refused_unless_it_is_0(scene: Path, model: str, coefficient: str):
+    lens = FISHEYE if "FISHEYE" in model else BROWN
+    with_lens(scene, model, lens | {coefficient: 0.0})
+    with pytest.raises(SceneError, match=f"the coefficient {coefficient}, which nerfstudio cannot undistort"):
+        with_lens(scene, model, lens | {coefficient: 0.01})
 
 
 @pytest.mark.parametrize(
