@@ -175,11 +175,9 @@ def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
     moments: dict[tuple, list[Path]] = {}
     for path in photographs:
         with suppress(Exception), Image.open(path) as image:
-            tags = tags_of(image)
-            when, fraction = (str(tags.get(tag, "")).strip() for tag in _MOMENT)
+            when, fraction, *camera = _moment(tags_of(image))
             if when and fraction.strip("0"):  # many cameras write no fraction of a second, or 00
-                moment = (path.parent, when, fraction, *(str(tags.get(tag)) for tag in _LENS_TAGS[:2]))
-                moments.setdefault(moment, []).append(path)
+                moments.setdefault((path.parent, when, fraction, *camera), []).append(path)
     if versions := [paths for paths in moments.values() if len(paths) > 1]:
         first, second = sorted(versions[0])[:2]
         count = sum(map(len, versions)) - len(versions)
@@ -438,24 +436,19 @@ def focal_length_of_exif(photograph: Path) -> float | None:
         tags, diagonal = tags_of(image), np.hypot(*image.size)
     if _digital_zoom(tags) > 1:
         return None
-    try:
-        film = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
-    except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
-        return None
+    film = _number(tags, ExifTags.Base.FocalLengthIn35mmFilm)
     return film * diagonal / np.hypot(36, 24) if 0 < film < np.inf else None
 
 
 def _shrunk_focal_length(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     """Focal length in pixels of a photograph that was made smaller, by its focal plane's resolution; None of others."""
-    try:
-        if float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0) > 0:
-            return None
-        before = sorted(int(tags[tag]) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
-        across, scale = (now / then for now, then in zip(sorted(size), before, strict=True))
-        unit = _MILLIMETRES[tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)]
-        focal = float(tags[ExifTags.Base.FocalLength]) * float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit * scale
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # anything may be written there
+    unit = _MILLIMETRES.get(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    before = [_number(tags, tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    if _number(tags, ExifTags.Base.FocalLengthIn35mmFilm) > 0 or unit is None or not min(before) > 0:
         return None
+    across, scale = (now / then for now, then in zip(sorted(size), sorted(before), strict=True))
+    plane = _number(tags, ExifTags.Base.FocalPlaneXResolution) / unit
+    focal = _number(tags, ExifTags.Base.FocalLength) * plane * scale
     is_whole = np.isclose(across, scale, rtol=0.02)  # not a part of it, which was cut out
     return focal if is_whole and scale < _SHRUNK and 0 < focal < np.inf else None
 
@@ -471,8 +464,7 @@ def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> N
     walks: dict[tuple, list[tuple[str, str]]] = {}  # times, of each folder and camera
     for name in names:
         with Image.open(folder / name) as image:
-            tags = tags_of(image)
-        when, fraction, *camera = (str(tags.get(tag, "")).strip() for tag in (*_MOMENT, *_LENS_TAGS[:2]))
+            when, fraction, *camera = _moment(tags_of(image))
         if when:
             walks.setdefault((name.rpartition("/")[0], *camera), []).append((when, fraction))
     places = [np.argsort(sorted(range(len(walk)), key=walk.__getitem__)) for walk in walks.values()]
@@ -486,10 +478,20 @@ def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> N
         )
 
 
+def _number(tags: Mapping[int, Any], tag: int) -> float:
+    """A number of EXIF data; 0 where they say none."""
+    try:
+        return float(tags.get(tag) or 0)
+    except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
+        return 0.0
+
+
+def _moment(tags: Mapping[int, Any]) -> tuple[str, ...]:
+    """When a photograph was taken, to which fraction of a second, and by which camera, as EXIF data say."""
+    return tuple(str(tags.get(tag, "")).strip() for tag in (*_MOMENT, *_LENS_TAGS[:2]))
+
+
 def _digital_zoom(tags: Mapping[int, Any]) -> float:
     """How much a photograph is enlarged after it was taken, by its EXIF data; 1 where they say nothing."""
-    try:
-        ratio = float(tags.get(ExifTags.Base.DigitalZoomRatio, 1))
-    except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
-        return 1.0
+    ratio = _number(tags, ExifTags.Base.DigitalZoomRatio)
     return round(ratio, 2) if 1 < ratio < np.inf else 1.0

@@ -39,7 +39,7 @@ from shellgs_method.occlusion.contradiction import (
 from shellgs_method.occlusion.exposure import (
     Exposed,
     SurfaceColours,
-    exposed,
+    exposed_image,
     log_gains,
     points_on_surface,
     sightings_on_surface,
@@ -276,8 +276,7 @@ def _gains(views: Sequence[Exposed]) -> tuple[Float64[np.ndarray, "V 3"], Surfac
 
 
 def _at_mean_exposure(view: ShellView, log_gain: Float64[np.ndarray, " 3"]) -> ShellView:
-    image = exposed(view.image / 255, -torch.from_numpy(log_gain).float())
-    return replace(view, image=(255 * image).round().clamp(0, 255).byte())
+    return replace(view, image=exposed_image(view.image, -torch.from_numpy(log_gain).float()))
 
 
 def _relative_depth(found: Sweep, size: tuple[int, ...]) -> Float[np.ndarray, "H W"]:

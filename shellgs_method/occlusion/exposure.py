@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int, UInt8
 from numpy import ndarray
 from scipy.sparse import csr_array
 from torch import Tensor
@@ -40,6 +40,11 @@ _PRIOR = 1.0  # weight of what is known of a photograph without points: that of 
 def exposed(colours: Float[Tensor, "*N 3"], log_gain: Float[Tensor, "*#N 3"]) -> Float[Tensor, "*N 3"]:
     """Colours as a photograph stores them whose gain in linear light is exp(``log_gain``) by channel; not clipped."""
     return (colours - BLACK) * (POWER * log_gain).exp() + BLACK
+
+
+def exposed_image(image: UInt8[Tensor, "H W 3"], log_gain: Float[Tensor, "*#N 3"]) -> UInt8[Tensor, "H W 3"]:
+    """A photograph with another gain, as :func:`exposed`, clipped."""
+    return (255 * exposed(image / 255, log_gain)).round().clamp(0, 255).byte()
 
 
 class Exposed(NamedTuple):

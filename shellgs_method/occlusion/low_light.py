@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from shellgs_method.files.transfer import POWER
 from shellgs_method.occlusion.contradiction import ShellView
-from shellgs_method.occlusion.exposure import BLACK
+from shellgs_method.occlusion.exposure import BLACK, exposed_image
 
 DARK = 90
 """Median of the shell's brightness, of 255, below which photographs are brought to it."""
@@ -60,14 +61,13 @@ class LowLight:
 
     def comparable(self, view: ShellView) -> ShellView:
         """A view whose photograph can be compared."""
-        image = view.image.numpy()
+        image, left = view.image, 0.0
         if self.scale > 1:
-            image = (self.scale * (image - 255 * BLACK) + 255 * BLACK).round().clip(0, 255).astype(np.uint8)
-        left = 0.0
+            image = exposed_image(image, torch.tensor(math.log(self.scale) / POWER))
         if self.is_noisy:
-            image = cv2.GaussianBlur(image, (0, 0), BLUR)
+            image = torch.from_numpy(cv2.GaussianBlur(image.numpy(), (0, 0), BLUR))
             left = self.noise / (2 * math.sqrt(math.pi) * BLUR)  # the norm of the blur's weights
-        return replace(view, image=torch.from_numpy(image), noise=left)
+        return replace(view, image=image, noise=left)
 
 
 def noise(grey: Float[np.ndarray, "H W"]) -> float:

@@ -1142,6 +1142,18 @@ def without_colmap(monkeypatch) -> list[str]:
     return steps
 
 
+def answering(answers: dict[str, Any]) -> Any:
+    """Fake structure from motion with an answer of some steps, and a folder of nothing that is undistorted."""
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return answers.get(step, [])
+
+    return run_step
+
+
 def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch, caplog):
     for k in range(8):
         (tmp_path / "photographs" / "ab"[k > 4]).mkdir(parents=True, exist_ok=True)
@@ -1156,14 +1168,7 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
         "find_loops": [],
         "settle": 0,
     }
-
-    def run_step(step: str, arguments: dict, **_):
-        if step == "undistort":
-            for name in ("images", "sparse"):
-                (Path(arguments["output"]) / name).mkdir()
-        return answers.get(step)
-
-    monkeypatch.setattr(stages, "run_step", run_step)
+    monkeypatch.setattr(stages, "run_step", answering(answers))
     summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
     assert summary.missing == far
     assert "3 photographs of" in caplog.text
@@ -1186,14 +1191,7 @@ def test_a_model_that_is_torn_from_what_its_photographs_share_is_told(tmp_path, 
     for k in range(8):
         photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
     model = {"names": [f"{k}.jpg" for k in range(8)], "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
-
-    def run_step(step: str, arguments: dict, **_):
-        if step == "undistort":
-            for name in ("images", "sparse"):
-                (Path(arguments["output"]) / name).mkdir()
-        return [model | {"torn": ["4.jpg", "5.jpg"]}] if step == "reconstruct" else []
-
-    monkeypatch.setattr(stages, "run_step", run_step)
+    monkeypatch.setattr(stages, "run_step", answering({"reconstruct": [model | {"torn": ["4.jpg", "5.jpg"]}]}))
     capture(tmp_path / "photographs", tmp_path / "scene")
     assert "contradict nearly all that 4.jpg and 5.jpg and their neighbours have in common" in caplog.text
 
@@ -1237,14 +1235,7 @@ def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
     for k in range(8):
         photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
     model = {"names": [f"{k}.jpg" for k in range(8)], "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
-
-    def run_step(step: str, arguments: dict, **_):
-        if step == "undistort":
-            for name in ("images", "sparse"):
-                (Path(arguments["output"]) / name).mkdir()
-        return [model | {"zoomed": [0.3, "4.jpg", "5.jpg"]}] if step == "reconstruct" else []
-
-    monkeypatch.setattr(stages, "run_step", run_step)
+    monkeypatch.setattr(stages, "run_step", answering({"reconstruct": [model | {"zoomed": [0.3, "4.jpg", "5.jpg"]}]}))
     capture(tmp_path / "photographs", tmp_path / "scene")
     assert "seems to change by 30%, between 4.jpg and 5.jpg" in caplog.text
 
@@ -1274,14 +1265,9 @@ def test_a_focal_length_that_no_such_camera_has_is_told(tmp_path, monkeypatch, c
     for name in names:
         photograph(seed=int(name[0])).save(tmp_path / "photographs" / name, exif=exif)
     model = {"names": names, "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
-
-    def run_step(step: str, arguments: dict, **_):
-        if step == "undistort":
-            for name in ("images", "sparse"):
-                (Path(arguments["output"]) / name).mkdir()
-        return [model | {"lenses": [{"names": names, "focal": found}]}] if step == "reconstruct" else []
-
-    monkeypatch.setattr(stages, "run_step", run_step)
+    monkeypatch.setattr(
+        stages, "run_step", answering({"reconstruct": [model | {"lenses": [{"names": names, "focal": found}]}]})
+    )
     for _ in range(2):  # once it is finished, too
         capture(tmp_path / "photographs", tmp_path / "scene")
     assert ("focal length of 3 photographs, 0.jpg for example, is in doubt" in caplog.text) == bool(told)
@@ -1294,14 +1280,7 @@ def test_a_model_of_a_few_points_is_no_scene(tmp_path, monkeypatch, points, mess
     for k in range(5):
         photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
     found = [{"names": [f"{k}.jpg" for k in range(5)], "points": points, "reprojection_error": 0.5, "track_length": 3}]
-
-    def run_step(step: str, arguments: dict, **_):
-        if step == "undistort":
-            for name in ("images", "sparse"):
-                (Path(arguments["output"]) / name).mkdir()
-        return found if step == "reconstruct" else []
-
-    monkeypatch.setattr(stages, "run_step", run_step)
+    monkeypatch.setattr(stages, "run_step", answering({"reconstruct": found}))
     with pytest.raises(SceneError, match=message) if message else nullcontext():
         capture(tmp_path / "photographs", tmp_path / "scene")
     assert (tmp_path / "scene/colmap").exists() == (not message)

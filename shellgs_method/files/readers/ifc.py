@@ -75,7 +75,7 @@ _PASSING = ("DEMOLISH", "TEMPORARY")
 _MAP_SETS = {name.lower(): name for name in ("ePSet_MapConversion", "ePSet_ProjectedCRS")}
 _PROJECTION = 0.01
 """Largest difference of a map's scale from 1."""
-_FEET = _FOOT, _ = 0.3048, 1200 / 3937
+_FOOT, _SURVEY_FOOT = 0.3048, 1200 / 3937
 _BEYOND = 1e8
 """Metres that no easting or northing reaches."""
 _TWICE = 10_000.0
@@ -371,7 +371,7 @@ def _scaled(given: float, unit: float, named: float | None, path: Path) -> tuple
     Raises:
         SceneError: the scale is none between such units.
     """
-    units = [named] if named else [unit, 1.0, *_FEET]
+    units = [named] if named else [unit, 1.0, _FOOT, _SURVEY_FOOT]
     metres, scale = min(((each, given * each / unit) for each in units), key=lambda pair: abs(pair[1] - 1))
     if abs(scale - 1) <= _PROJECTION:
         return metres, scale
