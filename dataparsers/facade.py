@@ -171,11 +171,13 @@ def _rescaled(
     positions = poses[:, :3, 3]
     if np.spacing(np.abs(positions).max().astype(np.float32)) > ROUNDING * np.linalg.norm(np.ptp(positions, axis=0)):
         to_origin[:3, 3] = -positions.mean(axis=0)
-    oriented, motion = auto_orient_and_center_poses(
-        torch.from_numpy(to_origin @ poses).float(),
+    centred = torch.from_numpy(to_origin @ poses).float()
+    _, motion = auto_orient_and_center_poses(  # whose poses are other than by the motion where pca turns the scene over
+        centred,
         method=recording.orientation or config.orientation_method,  # pyright: ignore[reportArgumentType]
         center_method=config.center_method,
     )
+    oriented = motion @ centred
     farthest = float(oriented[:, :3, 3].abs().max())
     scale = 1.0 / farthest if farthest > 0 else 1.0
     oriented[:, :3, 3] *= scale
