@@ -20,7 +20,7 @@ from dataparsers.orientation import oriented
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
-from shellgs_method.files.frames import Frame, Recording
+from shellgs_method.files.frames import Frame, Recording, are_far
 from shellgs_method.files.photographs import View, tell_of_other_sizes
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
@@ -164,21 +164,26 @@ def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
 def _rescaled(
     recording: Recording, config: FacadeDataParserConfig
 ) -> tuple[torch.Tensor, Float64[np.ndarray, "4 4"], float]:
-    """Poses in nerfstudio's world (OpenGL, float32), and the rigid motion and then scale from the scene to it."""
+    """Poses in nerfstudio's world (OpenGL, float32), and the rigid motion and then scale from the scene to it.
+
+    Cameras that are far from all others count for neither: of one that is wrong, the scene would be a speck, in which
+    every step of the training goes too far.
+    """
     poses = np.stack([np.linalg.inv(frame.camera.viewmat.numpy()) for frame in recording.frames])
     poses = recording.applied @ poses @ OPENGL
     to_origin = np.eye(4)
-    positions = poses[:, :3, 3]
+    near = ~are_far(poses[:, :3, 3])
+    positions = poses[near, :3, 3]
     if np.spacing(np.abs(positions).max().astype(np.float32)) > ROUNDING * np.linalg.norm(np.ptp(positions, axis=0)):
         to_origin[:3, 3] = -positions.mean(axis=0)
     centred = torch.from_numpy(to_origin @ poses).float()
     _, motion = auto_orient_and_center_poses(  # whose poses are other than by the motion where pca turns the scene over
-        centred,
+        centred[near],
         method=recording.orientation or config.orientation_method,  # pyright: ignore[reportArgumentType]
         center_method=config.center_method,
     )
     oriented = motion @ centred
-    farthest = float(oriented[:, :3, 3].abs().max())
+    farthest = float(oriented[near, :3, 3].abs().max())
     scale = 1.0 / farthest if farthest > 0 else 1.0
     oriented[:, :3, 3] *= scale
     transform = np.vstack([motion.double().numpy(), [0, 0, 0, 1]]) @ to_origin @ recording.applied

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import inside
-from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
+from shellgs_method.geometry.outliers import inliers
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")  # the same by the name of other programs
@@ -31,6 +32,8 @@ _CORNER = 0.02
 """Share of the width and height that is a corner of a photograph."""
 _OFF_CENTRE = 0.2
 """Share of the width and height by which a principal point is far from the middle."""
+_FAR = 20.0
+"""Times the median distance of the cameras from their middle, beyond which one is far from all others."""
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
@@ -134,10 +137,26 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
             "cropped photographs have: give it and the size for the same photographs."
         )
     frames = sorted(frames, key=lambda frame: frame.name)
+    _tell_of_far(frames, where)
     for one, other in pairwise(frames):
         if one.name == other.name:
             raise SceneError(f"{where} has two cameras for the photograph {one.name}: leave one of them out")
     return frames
+
+
+def are_far(cameras: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Which cameras, by their positions, are far from all others, as where structure from motion went wrong."""
+    return ~inliers(cameras, _FAR)
+
+
+def _tell_of_far(frames: Sequence[Frame], where: str) -> None:
+    far = are_far(positions([frame.camera for frame in frames]))
+    if far.any():
+        name = next(frame.name for frame, is_far in zip(frames, far, strict=True) if is_far)
+        notice(
+            f"{where} has {far.sum()} of {len(frames)} cameras far from all others, that of {name} for example, as "
+            "where structure from motion went wrong: leave these photographs out, unless they were taken from there."
+        )
 
 
 def _is_at_corner(camera: Camera) -> bool:
