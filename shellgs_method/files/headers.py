@@ -126,13 +126,15 @@ def _check_lines(path: Path, length: int, elements: list[PlyElement]) -> None:
 
 _LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of a record of a LAS file besides its points
 _MOST_POINTS_PER_BYTE = 50  # of LAZ; scans have less than one
+_LAZ_EMPTY = 100  # bytes at most of the points of a LAZ without any: where its table of chunks is, and that
 
 
 def check_las(path: Path) -> None:
     """Check that a LAS or LAZ file is as long as its header claims (LAS 1.4 specification, table 3).
 
     Raises:
-        ValueError: it is cut off, or its header is damaged.
+        ValueError: it is cut off, or its header is damaged, or does not count all points, as of a program that ended
+            before it wrote the header again.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -161,6 +163,22 @@ def check_las(path: Path) -> None:
     most = (size - start) * _MOST_POINTS_PER_BYTE if kind & 0x80 else (size - start) // max(each, 1)
     if points > most:
         raise ValueError(f"its header claims {points} points, for which {size} bytes are too few")
+    waveforms = struct.unpack_from("<Q", header, 227)[0] if minor >= 3 and length >= 235 else 0
+    room = min(at for at in (size, waveforms, extended_start * bool(extended)) if at >= start) - start
+    if kind & 0x80:
+        more, there = points == 0 and room > _LAZ_EMPTY, f"{room} bytes of them"
+    else:
+        whole, rest = divmod(room, max(each, 1))
+        more, there = whole > points and rest == 0 and _is_written(path, start + points * each, each), f"{whole} points"
+    if more:
+        raise ValueError(f"its header counts {points} points, and {there} follow: export it again")
+
+
+def _is_written(path: Path, start: int, length: int) -> bool:
+    """Whether some bytes of a file are not all zero, as what fills it up is."""
+    with path.open("rb") as file:
+        file.seek(start)
+        return bool(file.read(length).strip(b"\0"))
 
 
 def buffer_file(path: Path, uri: str) -> Path:

@@ -1085,6 +1085,37 @@ def test_a_las_that_counts_its_points_as_before_1_4_alone_is_refused_as_such(tmp
         read_geometry(tmp_path / "a.las")
 
 
+@pytest.mark.parametrize(("suffix", "counted"), [("las", 0), ("las", 100), ("laz", 0)])
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+def test_a_las_whose_header_does_not_count_all_points_is_refused(
+    tmp_path: Path, suffix: str, counted: int, version: str
+):
+    """As of a program that ended before it wrote the header again: a part of the scan was taken for all of it."""
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version=version))
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    path = tmp_path / f"a.{suffix}"
+    las.write(str(path))
+    data = bytearray(path.read_bytes())
+    data[107:111] = counted.to_bytes(4, "little")
+    if version == "1.4":
+        data[247:255] = counted.to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match=f"its header counts {counted} points, and .* follow"):
+        read_geometry(path)
+
+
+def test_what_fills_up_a_las_is_no_point(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    las.write(str(tmp_path / "a.las"))
+    with (tmp_path / "a.las").open("ab") as file:
+        file.write(bytes(10 * las.header.point_format.size))
+    assert len(read_geometry(tmp_path / "a.las").vertices) == len(POINTS)
+
+
 @pytest.mark.parametrize("kind", [3, 6])
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_withheld_points_and_noise_of_a_las_are_left_out_and_counted(tmp_path: Path, caplog, kind: int, suffix: str):
