@@ -135,6 +135,15 @@ def test_a_walk_goes_folder_by_folder_with_numbers_in_their_order():
     assert sorted(["1/2", "01/1", "1/1", "01/2"], key=along_the_walk) == apart
 
 
+def test_seconds_since_1970_have_decimals():
+    """As robots name images by their times; Python writes no zeros at the end, ROS nanoseconds with all of theirs."""
+    seconds = [f"{1700000000 + k / 30}.jpg" for k in range(60)]
+    assert sorted(sorted(seconds), key=along_the_walk) == seconds
+    nanoseconds = [f"{1700000000 + k // 30}.{k % 30 * 33333333:09d}.jpg" for k in range(60)]
+    assert sorted(sorted(nanoseconds), key=along_the_walk) == nanoseconds
+    assert along_the_walk("walk1.9.jpg") < along_the_walk("walk1.10.jpg")
+
+
 def test_a_view_of_two_groups_is_not_matched_with_itself():
     assert bridges([["a", "b"], ["b", "c"]], 2) == [("a", "b"), ("a", "c"), ("b", "c")]
 
