@@ -208,13 +208,14 @@ def _by_angles(angles: Mapping[str, Any], given: Mapping[str, Any], photograph: 
 
 
 def _lens(source: Mapping[str, Any], where: str) -> dict[str, Any]:
-    return {key: source[key] for key in _LENS if key in source} | _distortion(source, where)
+    return {key: source[key] for key in _LENS if source.get(key) is not None} | _distortion(source, where)
 
 
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
     listed = source.get("distortion_params")
     if listed is None:
-        return {key: source[key] for key in (*COEFFICIENTS, *OTHER_COEFFICIENTS) if key in source}
+        names = (*COEFFICIENTS, *OTHER_COEFFICIENTS)
+        return {key: source[key] for key in names if source.get(key) is not None}
     if not isinstance(listed, list) or len(listed) != len(COEFFICIENTS):
         raise SceneError(f"{where}: distortion_params are {', '.join(COEFFICIENTS)}, not {str(listed)[:40]}")
     return dict(zip(COEFFICIENTS, listed, strict=True))

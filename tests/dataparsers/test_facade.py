@@ -174,6 +174,17 @@ def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given
     assert "has frames with another fl_x than it gives for all, and theirs counts" in caplog.text
 
 
+def test_null_in_a_camera_says_nothing(scene):
+    path = scene / "transforms.json"
+    before, meta = read_views(FacadeDataParserConfig(data=scene))[0], json.loads(path.read_text())
+    nothing = dict.fromkeys(("k1", "k4", "p1", "distortion_params", "camera_model", "fl_x", "mask_path"))
+    meta["frames"] = [each | nothing for each in meta["frames"]]
+    path.write_text(json.dumps(meta | {"k2": None}))
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    assert (view.lens, view.mask) == (None, None)
+    torch.testing.assert_close(view.camera.K, before.camera.K)
+
+
 @pytest.mark.parametrize(("size", "told"), [((4082, 3033), True), ((4000, 3000), False), ((2000, 1500), False)])
 def test_photographs_of_nearly_their_cameras_size_are_told_of(scene, caplog, size, told):
     """As the undistorted ones of COLMAP beside the cameras of the originals."""
