@@ -34,7 +34,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.interrupts import at_interrupt
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint, unwritten
-from shellgs_method.runs.folders import held
+from shellgs_method.runs.folders import claimed, held
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training
@@ -120,6 +120,11 @@ class FacadeTrainerConfig(TrainerConfig):
             check_training(self)
             folder = self.get_base_dir()
             folder.mkdir(parents=True, exist_ok=True)
+            if not claimed(folder):
+                raise SceneError(
+                    f"another training, which may have begun in the same second, writes to {folder}: begin again, or "
+                    "name the folder by --timestamp"
+                )
             with atomic_write(folder / "config.yml") as file:
                 file.write(written_config(self).encode())
         tell("Reading the scene")

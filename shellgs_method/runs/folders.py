@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 try:
     import fcntl
 except ImportError:  # Windows, where nothing is locked
     fcntl = None
+
+
+_CLAIMED: dict[Path, AbstractContextManager[bool]] = {}
+
+
+def claimed(folder: Path) -> bool:
+    """Lock a folder until this process ends; False where another process has it."""
+    folder = folder.resolve()
+    if folder in _CLAIMED:
+        return True
+    lock = held(folder)
+    if not lock.__enter__():
+        lock.__exit__(None, None, None)
+        return False
+    _CLAIMED[folder] = lock
+    return True
 
 
 @contextmanager

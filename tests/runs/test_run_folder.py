@@ -21,6 +21,7 @@ from shellgs_method.compare.measure import measure
 from shellgs_method.errors import SceneError
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.config_file import load_config
+from shellgs_method.runs.folders import held
 from shellgs_method.runs.run_folder import open_run
 from shellgs_method.runs.trained import load_run
 
@@ -88,6 +89,20 @@ def test_the_config_of_a_run_is_written_without_its_folder(tmp_path, monkeypatch
     config.save_config()
     assert "_run_folder" not in (tmp_path / NAMES / "config.yml").read_text()
     assert load_config(tmp_path / NAMES / "config.yml") == config
+
+
+def test_a_folder_that_another_training_writes_to_is_refused(tmp_path, monkeypatch):
+    """Two that begin in the same second have one folder: one's checkpoint was deleted, and the other's config lost."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    config = open_run(write_run(tmp_path / NAMES, Path("elsewhere"), Path("scene")))
+    refused = pytest.raises(SystemExit, match=r"another training, .* same second.*run: begin again, or .*--timestamp")
+    with held(tmp_path / NAMES), refused:
+        config.save_config()
+    config.save_config()
+    config.save_config()  # of the same process
+    with held(tmp_path / NAMES) as alone:
+        assert not alone
 
 
 def test_a_folder_in_place_of_a_config_is_called_one(tmp_path: Path):
