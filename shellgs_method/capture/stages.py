@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
@@ -250,12 +251,12 @@ class _Capture:
                 tell_of_unknown_lenses(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
-        with _counting(database, "descriptors") as done:
+        with _counting(database) as rows:
             self._step(
                 "extract",
                 "finding features",
                 len(self.names),
-                done,
+                partial(rows, "descriptors"),
                 database=str(database),
                 photographs=str(self.folder),
                 lenses=[asdict(lens) for lens in lenses],
@@ -346,7 +347,8 @@ class _Capture:
         return self._step("follow", "following the walk", 1, None, database=str(database), passes=order)
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
-        with _counting(database, "two_view_geometries") as done:
+        with _counting(database) as rows:
+            done = partial(rows, "two_view_geometries")
             self._step("match", description, len(pairs), done, database=str(database), pairs=pairs)
 
     def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
@@ -520,21 +522,15 @@ def _files(folder: Path) -> list[str]:
     return sorted(names, key=along_the_walk)
 
 
-def _rows(database: Path, table: str) -> int:
-    """Number of rows of a table."""
-    with _counting(database, table) as rows:
-        return rows()
-
-
 @contextmanager
-def _counting(database: Path, table: str) -> Iterator[Callable[[], int]]:
-    """What counts the rows of a table that another process is writing.
+def _counting(database: Path) -> Iterator[Callable[[str], int]]:
+    """What counts the rows of a table, with a condition perhaps, that another process may be writing.
 
     It keeps one connection: where one ends, SQLite locks the database for a moment, and COLMAP cannot open it.
     """
     kept: list[sqlite3.Connection] = []
 
-    def count() -> int:
+    def count(table: str) -> int:
         with suppress(sqlite3.Error):  # does not exist yet, or is busy
             if not kept:
                 kept.append(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True))
@@ -550,15 +546,16 @@ def _counting(database: Path, table: str) -> Iterator[Callable[[], int]]:
 
 def _flat_pairs(database: Path) -> float:
     """Share of the pairs that a homography explains: of a turning camera, of a plane, or of a camera that stood."""
-    counts = {kind: _rows(database, f"two_view_geometries WHERE rows > 0 AND config = {kind}") for kind in range(2, 9)}
     # COLMAP leaves out all matches of what stands at the same pixels.
     pairs = "matches JOIN two_view_geometries AS kept USING (pair_id)"
-    stood = _rows(database, f"{pairs} WHERE matches.rows >= {_MATCHED} AND kept.rows = 0")
+    with _counting(database) as rows:
+        counts = {kind: rows(f"two_view_geometries WHERE rows > 0 AND config = {kind}") for kind in range(2, 9)}
+        stood = rows(f"{pairs} WHERE matches.rows >= {_MATCHED} AND kept.rows = 0")
     return (stood + sum(counts[kind] for kind in _HOMOGRAPHIES)) / max(1, stood + sum(counts.values()))
 
 
 def _tidy(database: Path) -> None:
-    """Let SQLite remove the files that it made beside a database when :func:`_rows`, which may not, came last."""
+    """Let SQLite remove the files that it made beside a database when :func:`_counting`, which may not, came last."""
     writing = f"{database.absolute().as_uri()}?mode=rw"
     with suppress(sqlite3.Error), closing(sqlite3.connect(writing, uri=True)) as connection:
         connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()

@@ -966,7 +966,8 @@ def test_counting_rows_leaves_no_files_beside_the_database(tmp_path):
     database = tmp_path / "database.db"
     with closing(sqlite3.connect(database)) as connection:
         connection.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id); INSERT INTO cameras VALUES (1)")
-    assert stages._rows(database, "cameras") == 1
+    with stages._counting(database) as rows:
+        assert rows("cameras") == 1
     stages._tidy(database)
     assert list(tmp_path.iterdir()) == [database]
 
@@ -975,14 +976,14 @@ def test_rows_that_are_being_written_are_counted_over_one_connection(tmp_path, m
     """Each that ends locks the database for a moment, in which COLMAP fails to open it."""
     database, opened, connect = tmp_path / "database.db", [], sqlite3.connect
     monkeypatch.setattr(stages.sqlite3, "connect", lambda *a, **k: opened.append(connect(*a, **k)) or opened[-1])
-    with stages._counting(database, "cameras") as rows:
-        assert rows() == 0  # it does not exist yet
+    with stages._counting(database) as rows:
+        assert rows("cameras") == 0  # it does not exist yet
         with closing(connect(database)) as writing:
             writing.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id)")
             for k in range(3):
                 writing.execute("INSERT INTO cameras VALUES (?)", [k])
                 writing.commit()
-                assert rows() == k + 1
+                assert rows("cameras") == k + 1
     assert len(opened) == 1
     with pytest.raises(sqlite3.ProgrammingError, match="closed"):
         opened[0].execute("SELECT 1")
