@@ -23,7 +23,7 @@ from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
-from shellgs_method.registration.correspondences import MAX_ERROR, Correspondence, measured_again, residuals_in_words
+from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
@@ -185,8 +185,8 @@ def place_by_picks(
     fitted = [point.is_used for point in picked if point.is_sharp and not point.held_out]
     if 2 * sum(fitted) < len(fitted):
         raise SceneError(
-            f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs within {MAX_ERROR} m, "
-            "which three do by chance: are they of the same points, and all axes of the shell in one unit?"
+            f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs, which three do by "
+            "chance: are they of the same points, and all axes of the shell in one unit?"
         )
     alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [residuals_in_words(picked, "picks")], picked)

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.spatial.distance import pdist
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.paths import captured_name, folded
@@ -21,6 +22,7 @@ from shellgs_method.shell.alignment import Alignment
 MAX_ERROR = 0.15
 """Residual in metres from which a point is an outlier: five times the scatter of careful picks (1 cm on a scan, 3 cm
 from photographs) and of RTK positions (2 to 3 cm)."""
+_MAX_PIXELS = 5.0  # likewise, where a pixel is more than 3 cm, as in photographs from the air: none picks better
 LEFT_HANDED = (
     "the shell's coordinates are left-handed, as two axes are swapped or one has the wrong sign; export it again"
 )
@@ -80,8 +82,11 @@ def fit_robustly(
     metres_per_shell_unit: float,
     called: str,
     remedy: str,
+    pixels: Float64[np.ndarray, " N"] | float = 0.0,
 ) -> RobustFit:
-    """Fit a similarity by least squares to the largest set of candidates that agree within :data:`MAX_ERROR`.
+    """Fit a similarity by least squares to the largest set of candidates that agree.
+
+    They agree within :data:`MAX_ERROR`, or five pixels where these are more.
 
     Args:
         shell: points in the shell's frame, possibly georeferenced.
@@ -90,6 +95,7 @@ def fit_robustly(
         metres_per_shell_unit: 1 for a shell in metres.
         called: plural name of the points, for messages.
         remedy: advice if they lie on one line, for messages.
+        pixels: what a pixel is at each point, in scene units, if they are picked in photographs.
 
     Raises:
         SceneError: fewer than 3 points, or only points on one line, agree, or most do in a mirror.
@@ -97,9 +103,11 @@ def fit_robustly(
     survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
     shell = transformed(shell, survey_from_shell)
     _check_spread(scene[candidates], shell[candidates], called, remedy)
-    used = _consensus(scene, shell, candidates)
+    metres_per_scene_unit = np.median(pdist(shell[candidates]) / np.maximum(pdist(scene[candidates]), 1e-30))
+    limits = np.broadcast_to(np.maximum(MAX_ERROR, _MAX_PIXELS * metres_per_scene_unit * pixels), len(shell))
+    used = _consensus(scene, shell, candidates, limits)
     if used.sum() < _MOST * candidates.sum():
-        mirrored = _consensus(scene, shell * [-1.0, 1.0, 1.0], candidates)
+        mirrored = _consensus(scene, shell * [-1.0, 1.0, 1.0], candidates, limits)
         if mirrored.sum() >= max(_MOST * candidates.sum(), used.sum() + 2):  # one more may agree by chance
             raise SceneError(
                 f"{mirrored.sum()} of {candidates.sum()} {called} agree with the photographs once they are mirrored, "
@@ -107,8 +115,8 @@ def fit_robustly(
             )
     if used.sum() < 3:
         raise SceneError(
-            f"only {used.sum()} of {candidates.sum()} {called} agree with the photographs within {MAX_ERROR} m: are "
-            "they of the same points, and all axes of the shell in one unit?"
+            f"only {used.sum()} of {candidates.sum()} {called} agree with the photographs within {limits.max():.2g} m: "
+            "are they of the same points, and all axes of the shell in one unit?"
         )
     _check_spread(scene[used], shell[used], called, remedy)
     survey_from_scene = fit_similarity(scene[used], shell[used])
@@ -171,7 +179,9 @@ def _captured(name: str) -> str:
 _SPELLINGS = (str, _captured, lambda name: folded(_captured(name)))  # the strictest first
 
 
-def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+def _consensus(
+    scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"], limits: Float64[np.ndarray, " N"]
+) -> Bool[np.ndarray, " N"]:
     """Inliers of the best triple of points (MSAC, Torr and Zisserman 2000), over all triples if they are few."""
     indices = np.flatnonzero(candidates)
     thin = min(0.1, _thinness(scene[candidates]) / 2)  # all triples of a walk along a facade are thin
@@ -179,10 +189,11 @@ def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray
     for triple in _triples(indices):
         if _thinness(shell[triple]) < thin:
             continue
-        residual = np.linalg.norm(transformed(scene, fit_similarity(scene[triple], shell[triple])) - shell, axis=1)
-        total = np.minimum(residual[indices], MAX_ERROR) ** 2
+        apart = np.linalg.norm(transformed(scene, fit_similarity(scene[triple], shell[triple])) - shell, axis=1)
+        residual = apart / limits
+        total = np.minimum(residual[indices], 1) ** 2
         if total.sum() < cost:
-            best, cost = candidates & (residual < MAX_ERROR), total.sum()
+            best, cost = candidates & (residual < 1), total.sum()
     return best
 
 

@@ -80,36 +80,50 @@ class PickedPoint(Correspondence):
 def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
     """Read a file of picks, in the coordinate reference system that its header names, or else the shell's, ``crs``.
 
+    Lines of photographs that are not in the scene are left out, as of a list that is of several flights, and with them
+    points of which too little is left; both are told.
+
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
-            line cannot be read, names an image that is not in the scene, or contradicts another line.
+            line cannot be read or contradicts another, or no point is in two photographs of the scene.
     """
-    picks = _picks_of(Table.read(path, "picks"), views, crs)
-    if not picks:
-        raise SceneError(f"{path} holds no picks")
-    return picks
+    picks, elsewhere = _picks_of(Table.read(path, "picks"), views, crs)
+    if not elsewhere:
+        if not picks:
+            raise SceneError(f"{path} holds no picks")
+        return picks
+    partly = {name for name, _ in elsewhere}
+    kept = [pick for pick in picks if len(pick.pixels) > 1 or pick.name not in partly]
+    lost = partly - {pick.name for pick in kept}
+    image = elsewhere[0][1]
+    what = f"{len(elsewhere)} lines of {path} are of photographs that are not in the scene, {image} for example"
+    if not kept:
+        raise SceneError(f"{what}, and no point is left in two that are: quote names with spaces")
+    points = f", and with them {len(lost)} points that are in fewer than two others" if lost else ""
+    notice(f"{what}, and are left out{points}: quote names with spaces.")
+    return kept
 
 
-def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
+def _picks_of(table: Table, views: Sequence[View], crs: str) -> tuple[list[Pick], list[tuple[str, str]]]:
+    """The picks of a file, and the points and photographs of lines whose photographs are not in the scene."""
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
     named: dict[tuple[float, ...], str] = {}  # of points without a name: as the first line writes them
     captured: list[str] = []
+    elsewhere: list[tuple[str, str]] = []
     convert, columns = table.to_shell(crs), table.columns({**PIXELS, "image": IMAGE, "name": NAME}, _COLUMNS)
     for where, row in table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name"):
         coordinates = [row[axis] for axis in "XYZ"]
         point, pixel = np.array(coordinates, dtype=np.float64), (float(row["x"]), float(row["y"]))
+        name = row["name"] or named.setdefault(tuple(point), " ".join(coordinates))
         view = view_named(row["image"], views, where)
         if view is None:
-            raise SceneError(
-                f"{where}: {row['image']} is not a photograph of the scene: leave its lines out if its camera was not "
-                "found, and quote a name with spaces"
-            )
+            elsewhere.append((name, row["image"]))
+            continue
         names = {folded(name) for name in (PurePosixPath(view.name).name, view.image.name)}
         if folded(PureWindowsPath(row["image"]).name) not in names:
             captured.append(f"{row['image']} is {view.name}")
-        name = row["name"] or named.setdefault(tuple(point), " ".join(coordinates))
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
         if view.name in pixels.setdefault(name, {}):
@@ -121,7 +135,7 @@ def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
             "be those of the photographs in the scene, which have no lens distortion."
         )
     points = convert(np.array([*shell.values()]).reshape(-1, 3))
-    return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
+    return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)], elsewhere
 
 
 @dataclass(frozen=True)
@@ -144,16 +158,21 @@ class PicksFile:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            SceneError: as :func:`read_picks`.
+            SceneError: as :func:`read_picks`, or a photograph is not in the scene: it would be written without.
         """
         table = Table.read(path, "picks")
-        picks = _picks_of(table, views, crs)
+        picks, elsewhere = _picks_of(table, views, crs)
+        if elsewhere:
+            raise SceneError(
+                f"{len(elsewhere)} lines of {path} are of photographs that are not in the scene, {elsewhere[0][1]} for "
+                "example: give a copy without them, as the file is written anew; quote names with spaces"
+            )
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
         for line in table.others:
             after = line.lstrip("# \t").rstrip()
             try:
-                (pick,) = _picks_of(replace(table, lines=[(str(path), words_of(after, str(path)))]), views, crs)
-            except SceneError:  # the header, or words
+                (pick,), _ = _picks_of(replace(table, lines=[(str(path), words_of(after, str(path)))]), views, crs)
+            except ValueError:  # the header, words, or of no photograph of the scene
                 is_system = after == table.system
                 if not crs or after == crs if is_system else line.startswith("#") and not table.is_header(after):
                     others.append(line)
@@ -232,10 +251,10 @@ def align_picks(
     Raises:
         SceneError: a point cannot be triangulated, or fewer than 3 points off one line can be trusted.
     """
-    scene, reprojection, worst_view, sharp = _triangulate_all(picks, views)
+    scene, reprojection, worst_view, sharp, pixels = _triangulate_all(picks, views)
     candidates = sharp & ~np.array([pick.held_out for pick in picks])
     shell = np.stack([pick.shell for pick in picks])
-    fit = fit_robustly(shell, scene, candidates, metres_per_shell_unit, "picks", "pick a point beside it")
+    fit = fit_robustly(shell, scene, candidates, metres_per_shell_unit, "picks", "pick a point beside it", pixels)
     points = [
         PickedPoint(
             pick.name,
@@ -263,7 +282,7 @@ def picked_again(
     Raises:
         SceneError: a pick cannot be triangulated.
     """
-    scene, reprojection, worst_view, _ = _triangulate_all(picks, views)
+    scene, reprojection, worst_view, *_ = _triangulate_all(picks, views)
     found = {pick.name: k for k, pick in enumerate(picks)}
     moved = []
     for point in points:
@@ -294,11 +313,13 @@ class Triangulation:
         point: its coordinates in the scene's frame.
         errors: reprojection error in each photograph, in pixels, by the view's name.
         is_sharp: whether the pixels agree on one point.
+        pixel: what a pixel is at the point, in scene units.
     """
 
     point: Float64[np.ndarray, " 3"]
     errors: Mapping[str, float]
     is_sharp: bool
+    pixel: float
 
 
 def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
@@ -326,15 +347,17 @@ def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
     except ValueError as error:
         raise SceneError(f"the pick {pick.name} cannot be triangulated: {error}") from error
     limits = [MAX_REPROJECTION * max(1.0, max(v.camera.width, v.camera.height) / 1000) for v in seen]
-    return Triangulation(point, dict(zip(pick.pixels, error.tolist(), strict=True)), bool((error <= limits).all()))
+    depths = viewmats[:, 2, :3] @ point + viewmats[:, 2, 3]
+    errors = dict(zip(pick.pixels, error.tolist(), strict=True))
+    return Triangulation(point, errors, bool((error <= limits).all()), float(np.median(depths / Ks[:, 0, 0])))
 
 
 def _triangulate_all(
     picks: Sequence[Pick], views: Sequence[View]
-) -> tuple[np.ndarray, list[float], list[str], Bool[np.ndarray, " N"]]:
+) -> tuple[np.ndarray, list[float], list[str], Bool[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
     by_name = {view.name: view for view in views}
     found = [triangulated(pick, by_name) for pick in picks]
     worst_view = [max(one.errors, key=lambda name: one.errors[name]) for one in found]
     reprojection = [max(one.errors.values()) for one in found]
-    sharp = np.array([one.is_sharp for one in found])
-    return np.stack([one.point for one in found]), reprojection, worst_view, sharp
+    sharp, pixels = np.array([one.is_sharp for one in found]), np.array([one.pixel for one in found])
+    return np.stack([one.point for one in found]), reprojection, worst_view, sharp, pixels

@@ -92,6 +92,12 @@ def test_a_comment_in_the_middle_of_a_point_is_kept_and_no_pick(tmp_path, views)
     assert file.others == lines[2:]
 
 
+def test_a_list_of_other_flights_too_is_not_written_anew(tmp_path, views):
+    (tmp_path / "p.txt").write_text("1 2 3 4 5 'a photo 0.png' a\n1 2 3 4 5 another.png a\n")
+    with pytest.raises(SceneError, match=r"1 lines of .* not in the scene, another.png for example: give a copy"):
+        Session(tmp_path / "p.txt", views)
+
+
 @pytest.mark.parametrize("header", [["EPSG:4326"], ["# EPSG:4326"], ["EPSG:4326", "lon lat h x y image name"]])
 def test_picks_in_degrees_are_gone_on_with_in_the_scans_system(tmp_path, views, header):
     lines = [*header, "7.86 46.25 215 4 5 'a photo 0.png' a", "7.86 46.25 215 6 7 'a photo 1.png' a", "# by hand"]
