@@ -34,6 +34,9 @@ _OFF_CENTRE = 0.2
 """Share of the width and height by which a principal point is far from the middle."""
 _FAR = 20.0
 """Times the median distance of the cameras from their middle, beyond which one is far from all others."""
+SKEW = ("skew", "sk_x", "sk_y")
+"""What programs call the entries of the intrinsics that are 0 in all cameras."""
+_SKEWED = 0.1  # pixels; matrices that were decomposed have hardly any
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
@@ -80,7 +83,8 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
         scene: the scene's folder.
         name: path of the photograph, relative to the scene.
         pose: camera to scene, OpenCV axes.
-        lens: fl_x, fl_y, cx, cy, w, h and optionally distortion coefficients and camera_model, as in transforms.json.
+        lens: fl_x, fl_y, cx, cy, w, h and optionally distortion coefficients, a skew and camera_model, as in
+            transforms.json.
         where: file of the camera, for messages.
 
     Raises:
@@ -106,9 +110,15 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
             f"{angle:.0f}°: give them in pixels, not in millimetres or as a share of the width"
         )
     distortion = tuple(number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
-    for key in OTHER_COEFFICIENTS if fisheye else ("k4", *OTHER_COEFFICIENTS):
+    for key in (*(("p1", "p2") if fisheye else ("k4",)), *OTHER_COEFFICIENTS):
         if key in lens and number(lens, key, where) != 0:
             raise SceneError(f"{where} has the coefficient {key}, which nerfstudio cannot undistort; {UNDISTORT}")
+    for key in SKEW:
+        if key in lens and (off := abs(number(lens, key, where)) * height / 2 / fy) > _SKEWED:
+            raise SceneError(
+                f"{where} has the skew {key}, by which its edges are {off:.2g} pixels off, and which nerfstudio does "
+                "not know: calibrate it without"
+            )
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
     distorts = fisheye or any(distortion)

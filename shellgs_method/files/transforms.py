@@ -13,7 +13,7 @@ from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order, number
+from shellgs_method.files.frames import FISHEYE, SKEW, Frame, Recording, frame, in_order, number
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
 from shellgs_method.files.readers.ply import ply_points, read_ply
@@ -33,7 +33,7 @@ _OPENDRONEMAP = "reconstruction.ply"
 """Name of the point cloud that ns-process-data makes of OpenDroneMap's."""
 _SHARE = 0.05  # of the longer side, by which a principal point is off the middle at most
 _ANGLES = ("camera_angle_x", "camera_angle_y")
-_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model")
+_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *SKEW)
 
 
 def read_recording(scene: Path, images_path: Path) -> Recording:

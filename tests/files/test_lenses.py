@@ -138,13 +138,21 @@ def test_a_lens_that_folds_the_photograph_is_refused(scene: Path, model: str, co
 
 
 @pytest.mark.parametrize(
-    ("model", "coefficient"), [("OPENCV", "k4"), ("OPENCV", "k6"), ("OPENCV", "s1"), ("OPENCV_FISHEYE", "k5")]
+    ("model", "coefficient"),
+    [("OPENCV", "k4"), ("OPENCV", "k6"), ("OPENCV", "s1"), ("OPENCV_FISHEYE", "k5"), ("OPENCV_FISHEYE", "p1")],
 )
 def test_a_coefficient_unknown_to_nerfstudio_is_refused_unless_it_is_0(scene: Path, model: str, coefficient: str):
     lens = FISHEYE if "FISHEYE" in model else BROWN
     with_lens(scene, model, lens | {coefficient: 0.0})
     with pytest.raises(SceneError, match=f"the coefficient {coefficient}, which nerfstudio cannot undistort"):
         with_lens(scene, model, lens | {coefficient: 0.01})
+
+
+@pytest.mark.parametrize("key", ["skew", "sk_x"])
+def test_a_skew_is_refused_unless_it_is_a_rounding(scene: Path, key: str):
+    with_lens(scene, "OPENCV", {key: 1e-6})
+    with pytest.raises(SceneError, match=f"has the skew {key}, by which its edges are 0.81 pixels off"):
+        with_lens(scene, "OPENCV", {key: 2.0})
 
 
 @pytest.mark.parametrize(
