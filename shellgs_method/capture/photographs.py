@@ -41,6 +41,7 @@ _EXCERPT = 4096  # bytes
 _THUMBNAIL, _BRIGHT = 320, 90  # pixels of a photograph whose brightness is measured; its median, of 255, by day
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
+_PLACEHOLDER = ".icloud"  # of a hidden file in the place of one that macOS keeps elsewhere: .IMG_0001.HEIC.icloud
 _LENS_TAGS = (
     ExifTags.Base.Make,
     ExifTags.Base.Model,
@@ -89,14 +90,18 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
 
 def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
     """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
-    below = (path for path in sorted(files_below(folder)) if not is_hidden(path.relative_to(folder)))
-    files = [path for path in below if path.is_file()]
+    files = [
+        path
+        for path in sorted(files_below(folder))
+        if not is_hidden((path.parent if path.suffix == _PLACEHOLDER else path).relative_to(folder)) and path.is_file()
+    ]
     developed = {path.with_suffix("") for path in photographs}
     raw = [path for path in files if path.suffix.lower() in RAW and path.with_suffix("") not in developed]
     if raw:
         raise SceneError(f"{len(raw)} files of {folder} are raw photographs, {raw[0].name} for example: {DEVELOP}")
     others = Counter(path.suffix.lower() or path.name for path in files if path.suffix.lower() not in PHOTOGRAPHS)
-    counted = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+    said = {_PLACEHOLDER: " that iCloud has not downloaded yet"}
+    counted = ", ".join(f"{count} {suffix}{said.get(suffix, '')}" for suffix, count in sorted(others.items()))
     if not photographs:
         videos = "; of videos, give one file" if VIDEOS & others.keys() else ""
         there = f", but {counted}" if counted else ""

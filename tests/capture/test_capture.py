@@ -646,6 +646,17 @@ def test_what_is_no_photograph_is_counted_but_not_a_developed_raw(tmp_path, capl
     assert "(1 .cr2, 1 .mov, 1 .txt)" in caplog.text
 
 
+def test_photographs_that_icloud_has_not_downloaded_are_told(tmp_path, caplog):
+    (tmp_path / ".IMG_2.HEIC.icloud").write_bytes(b"bplist00")
+    with pytest.raises(SceneError, match=r"no photographs in .*, but 1 \.icloud that iCloud has not downloaded yet"):
+        find_photographs(tmp_path)
+    photograph().save(tmp_path / "IMG_1.JPG")
+    (tmp_path / "._IMG_1.JPG").write_bytes(b"resource fork")
+    assert list(find_photographs(tmp_path)) == ["IMG_1.JPG"]
+    assert "1 files of" in caplog.text
+    assert "are left out (1 .icloud that iCloud has not downloaded yet)" in caplog.text
+
+
 def test_a_folder_of_videos_is_refused_with_what_it_holds(tmp_path):
     (tmp_path / "a.MP4").touch()
     with pytest.raises(SceneError, match=r"no photographs in .*, but 1 \.mp4; of videos, give one file"):
