@@ -187,9 +187,9 @@ def remedy_for(model: str) -> str:
 
 def _is_fisheye(lens: Mapping[str, Any], where: str) -> bool:
     model = str(lens.get("camera_model", "OPENCV")).upper()
-    if model not in (*PERSPECTIVE, "PERSPECTIVE", FISHEYE):
+    if model not in (*PERSPECTIVE, "PERSPECTIVE", FISHEYE, "FISHEYE"):
         raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {remedy_for(model)}")
-    return model == FISHEYE
+    return model in (FISHEYE, "FISHEYE")
 
 
 def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.frames import FISHEYE, SKEW, Frame, Recording, frame, in_order, number
+from shellgs_method.files.frames import SKEW, Frame, Recording, frame, in_order, number
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
 from shellgs_method.files.readers.ply import ply_points, read_ply
@@ -31,8 +32,11 @@ _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _METASHAPE = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]]
 _OPENDRONEMAP = "reconstruction.ply"
 """Name of the point cloud that ns-process-data makes of OpenDroneMap's."""
+_LISTED = "distortion_params"
 _SHARE = 0.05  # of the longer side, by which a principal point is off the middle at most
 _ANGLES = ("camera_angle_x", "camera_angle_y")
+# What programs call parts of a lens that nerfstudio calls otherwise.
+_UNREAD = re.compile("[kps]_?[0-9]|k|camera_matrix|.*intrinsics?.*|dist(_?coeffs?|ortion.*)?|([xy]_)?fov(_[xy])?")
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *SKEW)
 
 
@@ -61,12 +65,23 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     named = {split: _names(meta.get(f"{split}_filenames", []), files, path) for split in _SPLITS}
     listed = {split: names for split, names in named.items() if names}  # an empty list says that the split has none
     files.tell_what_is_elsewhere()
+    _tell_of_unread({key for source in (meta, *listed_frames) for key in source}, path)
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
     if np.array_equal(applied[:3], _METASHAPE):
         _tell_of_metashape([each.lens for each in frames if each.lens and not each.lens.fisheye], path)
     return Recording(in_order(frames, str(path)), applied, listed, orientation)
+
+
+def _tell_of_unread(keys: set[str], path: Path) -> None:
+    """Tell the user of what may be a part of the lens, under names that nerfstudio does not have."""
+    known = {*_LENS, *COEFFICIENTS, *OTHER_COEFFICIENTS, _LISTED}
+    if unread := sorted(key for key in keys - known if _UNREAD.fullmatch(key.lower())):
+        notice(
+            f"{path} has {' and '.join(unread)} of lenses, which is not read: give it as fl_x, fl_y, cx, cy, k1 to k4, "
+            "p1 and p2, if these do not say it already."
+        )
 
 
 def _tell_of_metashape(lenses: Sequence[Lens], path: Path) -> None:
@@ -151,7 +166,7 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
             "own parsers take the one for all."
         )
     fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
-    if fisheye is True and str(lens.get("camera_model")).upper() != FISHEYE:  # instant-ngp's
+    if fisheye is True and "FISHEYE" not in str(lens.get("camera_model")).upper():  # instant-ngp's
         raise SceneError(
             f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
         )
@@ -212,7 +227,7 @@ def _lens(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
-    listed = source.get("distortion_params")
+    listed = source.get(_LISTED)
     if listed is None:
         names = (*COEFFICIENTS, *OTHER_COEFFICIENTS)
         return {key: source[key] for key in names if source.get(key) is not None}
