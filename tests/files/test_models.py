@@ -523,6 +523,14 @@ def test_a_layer_of_air_is_no_glass(tmp_path: Path):
     assert (read_geometry(file.save(tmp_path / "a.ifc")).classes == SurfaceClass.ROOF).all()
 
 
+@pytest.mark.parametrize(("kind", "taken"), [("IfcSlab", SurfaceClass.ROOF), ("IfcBeam", SurfaceClass.OTHER)])
+def test_what_bears_is_no_window_where_it_is_half_transparent(tmp_path: Path, kind: str, taken: SurfaceClass):
+    file = made.Ifc()
+    predefined = {"PredefinedType": "ROOF"} if kind == "IfcSlab" else {}
+    file.block(kind, (0, 0, 3), (6, 4, 3.1), glass=True, **predefined)
+    assert (read_geometry(file.save(tmp_path / "a.ifc")).classes == taken).all()
+
+
 HEADERS = [
     (r"^", "\ufeff"),
     (r"FILE_NAME\('[^']*'", r"FILE_NAME('C:\\Temp\\house.ifc'"),

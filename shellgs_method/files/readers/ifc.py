@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import Geometry, say_left_out
@@ -60,11 +60,12 @@ _UNSEEN = {
     "IfcGeographicElement": ("VEGETATION", "SOIL_BORING_POINT"),
 }
 _GLASS = 0.3
-"""Transparency from which a part of anything but a door is a window: the glazing of a curtain wall, for example.
+"""Transparency from which a part of a product is a window: the glazing of a curtain wall, for example.
 
 A layer of air is a solid without any colour, of a transparency of 1.
 """
-
+_NO_GLASS = ("IfcDoor", "IfcSlab", "IfcBeam", "IfcColumn", "IfcFooting", "IfcPile")
+"""Products without windows: programs draw floors and beams half transparent to show what they hold."""
 
 _NO_SURFACE = {
     *("Annotation", "Axis", "Box", "Clearance", "CoG", "FootPrint", "Lighting", "Profile", "Reference", "SurveyPoints"),
@@ -109,7 +110,9 @@ def read_ifc(path: Path) -> Geometry:
     seen = [each for each in products if classes[each.id()] is not None]
     if any(each.Name == "Status" for each in model.by_type("IfcProperty")):
         _tell_of_phases(path, seen, ifcopenshell)
-    made = [_read(shape, classes[shape.id]) for shape in _shapes(ifcopenshell.geom, model, seen)]
+    glazed = {each.id() for each in seen if not any(_is(each, name) for name in _NO_GLASS)}
+    shapes = _shapes(ifcopenshell.geom, model, seen)
+    made = [_read(shape, classes[shape.id], shape.id in glazed) for shape in shapes]
     made.sort(key=lambda part: part.product)  # threads finish them in any order
     known = {part.product for part in made}
     failed = [each for each in seen if each.id() not in known and _has_body(each)]
@@ -192,11 +195,14 @@ class _Part(NamedTuple):
     classes: UInt8[np.ndarray, " F"]
 
 
-def _read(shape: Any, own: SurfaceClass | None) -> _Part:
+def _read(shape: Any, own: SurfaceClass | None, glazed: bool) -> _Part:
     matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
     vertices = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
     faces = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
-    return _Part(shape.id, vertices, faces, _with_glass(own, shape.geometry, len(faces)))
+    classes = np.full(len(faces), own, np.uint8)
+    if glazed:
+        classes[_glass(shape.geometry, len(faces))] = SurfaceClass.WINDOW
+    return _Part(shape.id, vertices, faces, classes)
 
 
 def _complete(path: Path, model: Any, products: list) -> None:
@@ -281,14 +287,13 @@ def _is(product: Any, name: str) -> bool:
         return False
 
 
-def _with_glass(own: SurfaceClass | None, shape: Any, count: int) -> UInt8[np.ndarray, " F"]:
-    """Classes of a shape's triangles: panes of whatever is no door are windows."""
-    classes = np.full(count, own, np.uint8)
+def _glass(shape: Any, count: int) -> Bool[np.ndarray, " F"]:
+    """Which of a shape's triangles are of glass."""
     glass = np.array([_GLASS <= material.transparency < 1 for material in shape.materials], bool)
     styles = np.array(shape.material_ids, np.int64)
-    if own != SurfaceClass.DOOR and len(styles) == count and len(glass):
-        classes[(styles >= 0) & glass[styles]] = SurfaceClass.WINDOW
-    return classes
+    if len(styles) != count or not len(glass):
+        return np.zeros(count, bool)
+    return (styles >= 0) & glass[styles]
 
 
 def _has_body(product: Any) -> bool:
