@@ -137,12 +137,17 @@ def _written_in(path: Path) -> str:
             file.close()
     if suffix == ".ifczip":
         with ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if name.lower().endswith(".ifc")]
-            return _named_in(b"".join(map(archive.read, names)), _IN_FILES[".ifc"])
+            return _named_in(b"".join(map(archive.read, models_of(archive))), _IN_FILES[".ifc"])
     if (pattern := _IN_FILES.get(suffix)) is None:
         return ""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
         return _named_in(contents, pattern)
+
+
+def models_of(archive: ZipFile) -> list[str]:
+    """Names of the models of an ``.ifczip``, without those of files that macOS puts beside its own."""
+    names = (name for name in archive.namelist() if name.lower().endswith(".ifc"))
+    return [name for name in names if not Path(name).name.startswith("._")]
 
 
 def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:

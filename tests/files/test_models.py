@@ -200,7 +200,7 @@ def test_swapped_axes_are_told_by_roofs_that_face_down(tmp_path: Path, caplog, s
     assert ("northing before easting" in caplog.text) == swapped
 
 
-def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog):
+def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog, capsys):
     file = made.ifc_house(unit=1.0)
     file.project.UnitsInContext = None
     with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
@@ -208,6 +208,7 @@ def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog)
         archive.writestr("__MACOSX/folder/._A.IFC", "a fork")
     assert_cast_as(tmp_path / "a.ifczip", made.ifc_house_faces())
     assert "names no unit of length" in caplog.text
+    assert "Reading parts of a.ifczip: 1 of 4" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("names", [("a.ifcxml",), ("a.ifc", "b/B.IFC")])

@@ -16,11 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.crs import models_of
 from shellgs_method.files.readers.contents import Geometry, say_left_out
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import stacked
 from shellgs_method.machine.extras import import_extra
+from shellgs_method.machine.progress import track
 
 _END = b"END-ISO-10303-21"
 _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
@@ -111,7 +113,7 @@ def read_ifc(path: Path) -> Geometry:
     if any(each.Name == "Status" for each in model.by_type("IfcProperty")):
         _tell_of_phases(path, seen, ifcopenshell)
     glazed = {each.id() for each in seen if not any(_is(each, name) for name in _NO_GLASS)}
-    shapes = _shapes(ifcopenshell.geom, model, seen)
+    shapes = track(_shapes(ifcopenshell.geom, model, seen), f"Reading parts of {path.name}", len(seen))
     made = [_read(shape, classes[shape.id], shape.id in glazed) for shape in shapes]
     made.sort(key=lambda part: part.product)  # threads finish them in any order
     known = {part.product for part in made}
@@ -171,8 +173,7 @@ def _unzipped(path: Path, folder: str) -> Path:
         SceneError: there is none, or several.
     """
     with ZipFile(path) as archive:
-        names = [name for name in archive.namelist() if name.lower().endswith(".ifc")]
-        names = [name for name in names if not Path(name).name.startswith("._")]  # as macOS adds them
+        names = models_of(archive)
         if len(names) != 1:
             raise SceneError(
                 f"the shell {path} holds {len(names)} models in IFC: unpack it, and give those of the building"
