@@ -164,6 +164,27 @@ def test_lidar_and_depth_agree_with_the_collision_geometry(folder, collider):
     assert depth[8:10, 15:17] == pytest.approx(middle, abs=0.5)
 
 
+@pytest.mark.parametrize(
+    "optics", ['fovy="40"', 'sensorsize="6e-3 4e-3" resolution="600 400" focalpixel="400 500" principalpixel="50 -30"']
+)
+def test_the_camera_of_a_robot_shows_what_mujoco_does(folder, tmp_path, optics):
+    robot = tmp_path / "ball.xml"
+    robot.write_text(ROBOT.replace("<camera ", f"<camera {optics} "))
+    env = make(folder, robot=robot)
+    env.reset(seed=0)
+    camera = mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, env._camera
+    scene = mujoco.MjvScene(env.model, 10)
+    mujoco.mjv_updateScene(env.model, env.data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_STATIC, scene)
+    drawn = scene.camera[0]
+    high = np.array([drawn.frustum_top, drawn.frustum_bottom]) / drawn.frustum_near
+    half = drawn.frustum_width / drawn.frustum_near or high[0] * 160 / 90
+    wide = np.array([-half, half]) + drawn.frustum_center / drawn.frustum_near
+    (fx, _, cx), (_, fy, cy), _ = camera_of(env.model, env.data, env._camera, 160, 90).K.numpy()
+    assert (np.array([0, 160]) - cx) / fx == pytest.approx(wide, abs=1e-5)
+    assert (cy - np.array([0, 90])) / fy == pytest.approx(high, abs=1e-5)
+
+
 def test_the_bearing_is_positive_to_the_left(folder):
     env = make(folder, depth=False)
     observation, _ = env.reset(seed=0, options={"start": (2, -6), "goal": (2, -3), "heading": 0.0})

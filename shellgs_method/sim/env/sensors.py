@@ -88,13 +88,18 @@ def cast(
 
 
 def camera_of(model, data, number: int, width: int, height: int) -> Camera:
-    """A camera of MuJoCo's, of square pixels and with the middle of the image as principal point."""
+    """A camera of MuJoCo's: of one with a sensor, the image shows all of that, whatever the shape of either."""
     pose = np.eye(4)
     pose[:3, :3] = data.cam_xmat[number].reshape(3, 3) * [1, -1, -1]  # from OpenGL's axes
     pose[:3, 3] = data.cam_xpos[number]
-    focal = height / 2 / np.tan(np.radians(model.cam_fovy[number]) / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
-    return Camera(torch.from_numpy(np.linalg.inv(pose)).float(), K, width, height)
+    pixels, sensor = np.array([width, height]), model.cam_sensorsize[number]
+    focal, middle = np.full(2, height / 2 / np.tan(np.radians(model.cam_fovy[number]) / 2)), pixels / 2
+    if sensor.all():  # in metres, as are its focal lengths and the shift of its principal point
+        focal, shift = model.cam_intrinsic[number].reshape(2, 2) * pixels / sensor
+        middle = middle - shift
+    K = np.eye(3)
+    K[:2, :2], K[:2, 2] = np.diag(focal), middle
+    return Camera(torch.from_numpy(np.linalg.inv(pose)).float(), torch.from_numpy(K).float(), width, height)
 
 
 class SplatCamera:
