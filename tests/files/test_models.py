@@ -300,6 +300,13 @@ def test_roads_on_a_plan_do_not_keep_buildings_from_being_read(tmp_path: Path, c
     assert "1 polygon without heights" in caplog.text
 
 
+def test_the_innermost_dimension_of_coordinates_counts(tmp_path: Path):
+    text = made.citygml(made.surfaces_gml(moved(house()), "2.0"))
+    text = text.replace("<gml:MultiSurface>", '<gml:MultiSurface srsDimension="2">')
+    text = text.replace("<gml:posList>", '<gml:posList srsDimension="3">')
+    assert_cast_as(save(tmp_path / "a.gml", text), moved(house()))
+
+
 def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):
     faces = moved(house())
     inside = moved(house(), NATIONAL + np.array([0, 0, -1.0]))

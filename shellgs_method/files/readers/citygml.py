@@ -86,8 +86,15 @@ class _Model:
 
     @cached_property
     def flat(self) -> set[ET.Element]:
-        """Elements of geometries with two coordinates a corner."""
-        return {part for whole in self.root.iter() if whole.get("srsDimension") == "2" for part in whole.iter()}
+        """Elements of two coordinates a corner, as they or the nearest above them say."""
+        found, left = set[ET.Element](), [(self.root, "")]
+        while left:
+            element, above = left.pop()
+            dimension = element.get("srsDimension", above)
+            if dimension == "2" and not len(element):
+                found.add(element)
+            left += [(part, dimension) for part in element]
+        return found
 
     def linked(self, element: ET.Element) -> ET.Element | None:
         """What an element links to in this file; None if it has no link, or to what is not there."""
