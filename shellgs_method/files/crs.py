@@ -43,14 +43,17 @@ _SPELT: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = tup
 )
 """Names that PROJ does not know, and their codes: OpenDroneMap's, those of German surveys (their heights are left out),
 GML 2's, OGC's of two, EPSG's without a colon or with a blank, and PROJ's names before a code, as Metashape has them."""
+_IN_GML = re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")
 _IN_FILES = {
     ".ifc": re.compile(
         rb"(?:IFCPROJECTEDCRS\s*\(\s*|'Name'\s*,[^,]*,\s*IFC\w+\s*\(\s*(?='EPSG:))'([^']+)'", re.IGNORECASE
     ),
-    **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),
+    **dict.fromkeys((".gml", ".xml", ".citygml"), _IN_GML),
     **dict.fromkeys((".json", ".jsonl", ".cityjson"), re.compile(rb'"referenceSystem"\s*:\s*"([^"]+)"')),
 }
 
+_CORNER = re.compile(rb"lowerCorner[^>]*>\s*(-?\d+(?:\.\d+)?\s+-?\d+(?:\.\d+)?)[\s<]")
+"""Of the first envelope of a CityGML: longitude and latitude, in either order, and a height."""
 _VERTICAL, _VERTICAL_UNIT, _EPSG = 4096, 4099, range(1024, 32767)
 """GeoTIFF keys of the system of heights and of their unit, and what may be a code of EPSG there."""
 _UNIT, _FEET = 3076, {9002: "0.3048", 9003: "0.30480061"}
@@ -91,6 +94,8 @@ def name_of(crs: CRS) -> str:
 def crs_of(*paths: Path) -> str:
     """Name of the system that a shell's files, or a ``.prj`` beside one, say they are in; empty if unknown, or degrees.
 
+    Of a CityGML in degrees, which is read in metres, that of these.
+
     Raises:
         SceneError: they are in several.
     """
@@ -113,6 +118,8 @@ def _crs_of(path: Path) -> str:
         shown = f" ({named.strip()[:60]})" if named.strip() else ""
         notice(f"{source} names no coordinate reference system that PROJ knows{shown}: give the shell's with --crs.")
     if crs is not None and crs.is_geographic:
+        if source is path and (found := _zone(crs, path)):
+            return name_of(found[0])
         notice(f"{source} names {crs.name}, which is in degrees and so not the shell's: give the shell's with --crs.")
         return ""
     return name_of(crs) if crs else ""
@@ -138,10 +145,7 @@ def _written_in(path: Path) -> str:
     if suffix == ".ifczip":
         with ZipFile(path) as archive:
             return _named_in(b"".join(map(archive.read, models_of(archive))), _IN_FILES[".ifc"])
-    if (pattern := _IN_FILES.get(suffix)) is None:
-        return ""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
-        return _named_in(contents, pattern)
+    return _first_in(path, pattern) if (pattern := _IN_FILES.get(suffix)) else ""
 
 
 def models_of(archive: ZipFile) -> list[str]:
@@ -150,9 +154,49 @@ def models_of(archive: ZipFile) -> list[str]:
     return [name for name in names if not Path(name).name.startswith("._")]
 
 
+def metres_of_degrees(path: Path) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]] | None:
+    """Conversion of a CityGML's coordinates from degrees to metres, in the system that :func:`crs_of` names.
+
+    None where they are in no degrees, or where it is not known in which order these are.
+    """
+    crs = known_crs(_written_in(path))
+    if crs is None or (found := _zone(crs, path)) is None:
+        return None
+    zone, order = found
+    notice(f"{path} is in degrees of {crs.name}: it is read in metres of {zone.name}.")
+    convert = conversion(crs.to_2d(), zone)
+    return lambda points: np.column_stack([convert(points[:, order]), points[:, 2]])
+
+
+def _zone(crs: CRS, path: Path) -> tuple[CRS, list[int]] | None:
+    """The zone of UTM that a CityGML in degrees begins in, on their datum, and which they are: longitude and latitude.
+
+    None where that is not known, and of systems that are not in degrees and metres of height.
+    """
+    from pyproj import CRS
+    from pyproj.aoi import AreaOfInterest
+    from pyproj.database import query_utm_crs_info
+
+    is_gml = _IN_FILES.get(path.suffix.lower()) is _IN_GML
+    if not is_gml or not crs.is_geographic or any(axis.unit_conversion_factor != 1 for axis in crs.axis_info[2:]):
+        return None
+    corner = np.array([_first_in(path, _CORNER).split()], np.float64)
+    orders = [order for order in ([0, 1], [1, 0]) if corner.size and _within(crs, corner[:, order])[0]]
+    if len(orders) != 1 or crs.geodetic_crs is None:
+        return None
+    x, y = corner[0, orders[0]]
+    zones = query_utm_crs_info(crs.geodetic_crs.name, AreaOfInterest(x, y, x, y))
+    return (CRS.from_epsg(zones[0].code), orders[0]) if zones else None
+
+
+def _first_in(path: Path, pattern: re.Pattern[bytes]) -> str:
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
+        return _named_in(contents, pattern)
+
+
 def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:
     found = pattern.search(contents)
-    return found[1].decode().replace("\\/", "/") if found else ""
+    return found[1].decode(errors="replace").replace("\\/", "/") if found else ""
 
 
 def _of_las(header: LasHeader, path: Path) -> str:

@@ -15,11 +15,13 @@ import building_models as made
 import numpy as np
 import pytest
 from building_models import NATIONAL, Face, cameras_around, cast_polygons, house, moved
+from pyproj import CRS, Transformer
 from scenes import cast
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.panels import supervision_panel
+from shellgs_method.files.crs import crs_of
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.files.surfaces import read_geometry
@@ -305,6 +307,36 @@ def test_the_innermost_dimension_of_coordinates_counts(tmp_path: Path):
     text = text.replace("<gml:MultiSurface>", '<gml:MultiSurface srsDimension="2">')
     text = text.replace("<gml:posList>", '<gml:posList srsDimension="3">')
     assert_cast_as(save(tmp_path / "a.gml", text), moved(house()))
+
+
+def in_degrees(path: Path, system: str, order: Sequence[int], zone: str, place: Sequence[float]) -> list[Face]:
+    """Save the house in degrees; returns its faces in metres of a zone of UTM."""
+    faces = moved(house(), np.array(place))
+    convert = Transformer.from_crs(zone, CRS(system).to_2d(), always_xy=True).transform
+    degrees = [
+        Face([np.column_stack([*convert(*ring.T[:2]), ring[:, 2]])[:, order] for ring in face.rings], face.surface)
+        for face in faces
+    ]
+    corner = " ".join(map(repr, made.bounds(degrees).min(axis=0).tolist()))
+    envelope = f'<gml:Envelope srsName="{system}"><gml:lowerCorner>{corner}</gml:lowerCorner></gml:Envelope>'
+    text = made.citygml(made.surfaces_gml(degrees, "2.0"))
+    save(path, text.replace("<core:city", f"<gml:boundedBy>{envelope}</gml:boundedBy><core:city", 1))
+    return faces
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2], [0, 1, 2]])
+def test_a_citygml_in_degrees_is_read_in_metres(tmp_path: Path, caplog, order: Sequence[int]):
+    path = tmp_path / "a.gml"
+    faces = in_degrees(path, "EPSG:6697", order, "EPSG:6691", (385_000, 3_902_000, 2))
+    assert_cast_as(path, faces)
+    assert crs_of(path) == "EPSG:6691"
+    assert "is read in metres of JGD2011 / UTM zone 54N" in caplog.text
+
+
+def test_a_citygml_in_degrees_of_which_either_may_be_the_latitude_is_refused(tmp_path: Path):
+    in_degrees(tmp_path / "a.gml", "EPSG:4326", [1, 0, 2], "EPSG:32632", (410_000, 5_413_000, 2))
+    with pytest.raises(SceneError, match=r"has its coordinates in degrees \(such as 48\.\d+ 7\.\d+\): convert"):
+        read_geometry(tmp_path / "a.gml")
 
 
 def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.crs import metres_of_degrees
 from shellgs_method.files.readers.city import CityObject, Polygon, is_surface, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry, numbers_in
 
@@ -28,17 +29,17 @@ _DEEPEST = 100
 
 
 def read_citygml(path: Path) -> Geometry:
-    """Read what is seen from outside of the objects of a CityGML, in its units.
+    """Read what is seen from outside of the objects of a CityGML, in its units, or in metres if these are degrees.
 
     Raises:
-        SceneError: it is no CityGML, its coordinates are degrees, or nothing is seen of it.
+        SceneError: it is no CityGML, its coordinates are degrees of an unknown place, or nothing is seen of it.
         Exception: it is damaged; of any kind.
     """
     root = _parsed(path)
     of_service = root.tag.endswith("}FeatureCollection") and any("/citygml/" in each.tag for each in root.iter())  # WFS
     if _name(root) != "CityModel" and not of_service:
         raise SceneError(f"the shell {path} is XML, but no CityGML: export it as CityGML, CityJSON, IFC or a mesh")
-    model = _Model(root)
+    model = _Model(root, metres_of_degrees(path))
     return outside(list(model.objects()), path, model.missing)
 
 
@@ -63,12 +64,16 @@ def _name(element: ET.Element) -> str:
 class _Model:
     """The objects of a CityGML.
 
+    Args:
+        root: its outermost element.
+        metres: conversion of its coordinates, if they are in degrees.
+
     Attributes:
         missing: what is not read, by kind.
     """
 
-    def __init__(self, root: ET.Element) -> None:
-        self.root, self.missing = root, Counter[str]()
+    def __init__(self, root: ET.Element, metres: Callable[[np.ndarray], np.ndarray] | None) -> None:
+        self.root, self.metres, self.missing = root, metres, Counter[str]()
 
     def objects(self) -> Iterator[CityObject]:
         """The objects of the model, with their parts."""
@@ -176,6 +181,9 @@ class _Model:
         if template is None:
             self.missing["implicit geometry in another file"] += 1
             return
+        if self.metres:
+            self.missing["implicit geometry in a file in degrees"] += 1
+            return
         text = parts["transformationMatrix"].text if "transformationMatrix" in parts else None
         matrix = numbers_in(text).reshape(4, 4) if text else np.eye(4)
         point = self.linked(parts["referencePoint"])
@@ -192,8 +200,8 @@ class _Model:
         if self.flat and any(each in self.flat for each in polygon.iter()):
             self.missing["polygon without heights"] += 1
             return []
-        found = [ring_of(_positions(self._numbers(child))) for _, child in sorted(bounds, key=lambda bound: bound[0])]
-        return found
+        found = [_positions(self._numbers(child)) for _, child in sorted(bounds, key=lambda bound: bound[0])]
+        return [ring_of(self.metres(ring) if self.metres else ring) for ring in found]
 
     def _numbers(self, element: ET.Element) -> Float64[np.ndarray, " N"]:
         """Coordinates below an element, in all the ways in which GML writes them."""
