@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple, TypeVar
 
 from rich import progress
+from rich.markup import escape
 
 EVERY = 2.0
 """Seconds between two lines about the same work."""
@@ -70,7 +71,7 @@ class Lines:
 def track(items: Iterable[ItemT], description: str, total: int, transient: bool = True) -> Iterator[ItemT]:
     """As rich's function of this name, but where stdout is no terminal a line says from time to time how far it is."""
     if sys.stdout.isatty():
-        yield from progress.track(items, description, total, transient=transient)
+        yield from progress.track(items, escape(description), total, transient=transient)
         return
     lines = Lines(description, total)
     if total > 0:

@@ -36,6 +36,13 @@ def test_a_terminal_shows_a_bar_in_place_of_lines(monkeypatch, capsys):
     assert "of 2" not in capsys.readouterr().out
 
 
+def test_a_bar_names_brackets_as_they_are(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "100")
+    assert list(track([1, 2], "Reading house [v2].ifc", 2, transient=False)) == [1, 2]
+    assert "house [v2].ifc" in capsys.readouterr().out
+
+
 def test_what_is_printed_is_read_as_a_stage(clock, capsys):
     tell("Reading the scene")
     for _ in track("ab", "Evaluating view", 2):
