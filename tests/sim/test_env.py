@@ -450,6 +450,7 @@ def test_a_robot_without_bodies_a_free_one_first_or_actuators_is_refused(folder,
         ("</worldbody>", '<body><freejoint/><geom size="0.1"/></body></worldbody>', "a floor or another body"),
         ('mass="5"', 'mass="5" contype="2" conaffinity="2"', "nothing of the robot meets the ground"),
         ('<camera name="camera"', "<camera", "no camera named camera"),
+        ('<camera name="camera"', '<camera name="camera" projection="orthographic"', "camera is orthographic"),
         ("<worldbody>", '<worldbody><camera name="camera"/>', "camera named camera is fixed to the world"),
     ],
 )

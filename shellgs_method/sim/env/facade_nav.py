@@ -128,6 +128,11 @@ class FacadeNav(gymnasium.Env, EzPickle):
         joint = self.model.body_jntadr[self._root]
         self._qpos = self.model.jnt_qposadr[joint]
         self._lidar, self._camera = self._sensor("site", "lidar"), self._sensor("camera", "camera")
+        if self.model.cam_projection[self._camera] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE:
+            raise SceneError(
+                "the robot's camera is orthographic, and images are rendered in perspective: leave its projection "
+                "out of its MJCF file, and give its fovy in degrees"
+            )
         self._ground = self.model.geom("ground").id
         self._robot = np.isin(np.arange(self.model.ngeom), robot_geoms(self.model))
         self._foreign = np.isin(self.model.geom_group, (COLLISION, MOVING)) & ~self._robot
