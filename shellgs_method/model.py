@@ -85,8 +85,7 @@ class FacadeModelConfig(SplatfactoModelConfig):
     (of the heavier of two layers; expected in training)."""
     geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
     """Losses against the cues."""
-    # A value, not a factory: an older config.yml without this setting finds it on the class.
-    extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
+    extra: ExtraLossConfig = field(default_factory=ExtraLossConfig)
     """Terms beyond the paper."""
 
     coarse: Optional[Path] = None

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 import tyro
-import yaml
 from gsplat.strategy.ops import duplicate, remove
 from nerfstudio.scripts.exporter import ExportGaussianSplat
 from torch.nn.functional import normalize
@@ -109,19 +108,6 @@ def test_an_ablation_leaves_out_the_terms_it_does_not_name(name, kept):
 def test_an_ablation_is_a_registered_method_with_something_changed(name):
     config = parsed(ABLATIONS[name])
     assert config.pipeline != getattr(method_configs, METHODS[ABLATIONS[name][0]]).config.pipeline
-
-
-def test_a_config_file_without_the_settings_beyond_the_paper_still_loads():
-    stored = yaml.load(
-        "!!python/object:shellgs_method.model.FacadeModelConfig\n"
-        "cues: shell\n"
-        "geometry: !!python/object:shellgs_method.model.GeometryLossConfig\n"
-        "  ncc: local\n",
-        Loader=yaml.UnsafeLoader,
-    )
-    assert isinstance(stored.geometry, GeometryLossConfig)
-    assert stored.extra == ExtraLossConfig()
-    assert (stored.primitive, stored.depth, stored.trust) == ("3d", "expected", "shell")
 
 
 # 2dgs

@@ -22,7 +22,6 @@ from shellgs_method.files.atomic import atomic_write, fingerprint, recover_folde
 from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
 from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
-from shellgs_method.runs.config_file import renamed
 from shellgs_method.shell import Alignment
 from shellgs_method.shell.cast import MASKS
 from shellgs_method.trainer import FacadeTrainerConfig
@@ -267,9 +266,8 @@ class Run:
         recover_folder(self.folder)
         path, settings = self.recorded, self.settings
         if self.begun:
-            before = renamed(recorded_settings(path), settings)
             # An earlier version did not write all settings: those that it lacks had their defaults or did not exist.
-            known = settings | default_settings(self.variant.method) | before
+            known = settings | default_settings(self.variant.method) | recorded_settings(path)
             changed = [key for key in settings if settings[key] != known[key]]
             if changed:
                 what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])

@@ -131,7 +131,7 @@ class Blocks:
     overlap: float
     """How far extended regions reach beyond cores, in scene units."""
     cameras: BoundCameras = field(default_factory=BoundCameras, compare=False)
-    """Those of the scene when its photographs were found; an earlier version did not write them."""
+    """Those of the scene when its photographs were found."""
 
     def __post_init__(self) -> None:
         """Refuse extended regions that are smaller than their cores."""
@@ -209,7 +209,7 @@ class Blocks:
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:
             raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")
-        if not moved and contents.get("photographs_of", blocks.cuts) != blocks.cuts:
+        if not moved and contents.get("photographs_of") != blocks.cuts:
             raise SceneError(
                 f"{path} was edited: its cuts or its overlap are not those that its photographs were found with; run "
                 f"`shellgs blocks {path.parent}` again"

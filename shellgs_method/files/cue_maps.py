@@ -297,7 +297,7 @@ class CueMaps:
             path = self.scene / source
             # Outside the scene only a file (a shell) is opened: a manifest may name anything.
             known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
-            if known and sha256 not in (source_hash(path), content_hash(path)):
+            if known and sha256 != source_hash(path):
                 first = f"run `shellgs align {shlex.quote(str(self.scene))}` first, to validate it as it is now"
                 return f"{source} has changed since" + (f": {first}" if sha256 in self._validated else "")
         return None

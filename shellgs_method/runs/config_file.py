@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import sys
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -22,37 +22,6 @@ MAX_BYTES = 1 << 20
 """Largest config.yml; those of nerfstudio's methods have a hundredth of it."""
 _COMPLETE = ("method_name", "experiment_name", "timestamp", "output_dir", "pipeline", "vis")
 """Settings that every config.yml has; the last one is at its end."""
-
-_TRUST = {"uncontradicted": "photographs", "surface": "photographs", True: "photographs"}
-RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "agreement": ("normal_consistency", lambda value: value),
-    "agreement_from": ("normal_consistency_from", lambda value: value),
-    "consistency": ("smoothness", lambda value: value),
-    "seeds": ("init", {"none": "sfm", "shell": "shell"}.get),
-    "shell_counts": ("trust", _TRUST.get),
-    "geometry_of": ("trust", _TRUST.get),
-    "ignore_transients": ("trust", _TRUST.get),
-}
-"""New names of settings by their names in older files, and new values of the old ones, None where the default stays."""
-MOVED = {
-    "shellgs_method.supervision": "shellgs_method.losses.objective",
-    "shellgs_method.densification": "shellgs_method.gaussians.densification",
-}
-"""Modules of classes, by those that older files name."""
-GONE = {"shellgs_method.gaussians.densification.MCMCConfig"}
-"""Classes of settings that are no more."""
-
-
-def renamed(values: Mapping[str, Any], names: Container[str]) -> dict[str, Any]:
-    """Settings of an older file, under today's ``names`` too where these are others; both may be paths with dots."""
-    found = dict(values)
-    for path, value in values.items():
-        parent, dot, old = path.rpartition(".")
-        if path not in names and old in RENAMED:
-            new, converted = RENAMED[old]
-            if f"{parent}{dot}{new}" in names and (now := converted(value)) is not None:
-                found[f"{parent}{dot}{new}"] = now
-    return found
 
 
 def load_config(path: Path) -> TrainerConfig:
@@ -120,15 +89,8 @@ def _parts(value: Any) -> Iterator[Any]:
         yield from _parts([getattr(value, field.name) for field in fields(value)])
 
 
-def _today(path: str) -> str:
-    """The import path of a class that an older file may name by another."""
-    module, _, name = path.rpartition(".")
-    return f"{MOVED.get(module, module)}.{name}"
-
-
 def _find(path: str) -> Any:
     """The known object of an import path, or of an alias of it in an imported module; nothing is imported."""
-    path = _today(path)
     module, _, name = path.rpartition(".")
     elsewhere = vars(sys.modules[module]).get(name) if module in sys.modules else None
     found = _known().get(path, elsewhere)
@@ -138,12 +100,10 @@ def _find(path: str) -> Any:
 
 
 def _object(loader: Any, path: str, node: yaml.Node) -> Any:
-    if _today(path) in GONE:
-        return None
     cls = _find(path)
     if not (isinstance(cls, type) and is_dataclass(cls)):
         raise SceneError(f"it uses {path} as settings")
-    values = renamed(loader.construct_mapping(node, deep=True), {field.name for field in fields(cls)})
+    values = loader.construct_mapping(node, deep=True)
     given = [field for field in fields(cls) if field.init and field.name in values]
     for field in given:
         if not _fits(values[field.name], field):

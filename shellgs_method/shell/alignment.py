@@ -243,12 +243,12 @@ class Alignment:
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
             unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
             verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
-            known = dict(fields.get("metrics", fields.get("figures", {})))  # older files say figures
+            known = dict(fields.get("metrics", {}))
             metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
             cameras = BoundCameras.from_json(fields.get("cameras", {}))
             model = str(fields.get("model", ""))
             spacing = None if fields.get("spacing") is None else float(fields["spacing"])
-            up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
+            up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)
             return cls(
                 matrix,
                 _strings(fields["shell"]),

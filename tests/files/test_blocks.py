@@ -56,13 +56,6 @@ def test_a_file_whose_photographs_are_those_of_other_cuts_is_refused(tmp_path: P
     Blocks.read(path)
 
 
-def test_a_file_of_an_earlier_version_is_read(tmp_path: Path):
-    path = tmp_path / BLOCKS
-    PLAN.write(path)
-    path.write_text(path.read_text().replace("photographs_of", "unknown"))
-    assert Blocks.read(path) == PLAN
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

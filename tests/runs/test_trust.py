@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import pickle
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +26,7 @@ from training_runs import Method, small_disk, trainer_of
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.runs.checkpoints import load_checkpoint
-from shellgs_method.runs.config_file import RENAMED, _known, _Loader, load_config, renamed
+from shellgs_method.runs.config_file import _known, _Loader, load_config
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
 
@@ -141,49 +140,13 @@ def test_an_older_config_has_defaults_for_new_settings_and_drops_those_that_are_
     assert not hasattr(model, "of_an_earlier_build")
 
 
-def test_settings_keep_their_values_under_the_names_of_an_older_config(tmp_path):
-    config = copy.deepcopy(all_methods["2dgs"])
-    config.set_timestamp()
-    written = yaml.dump(config)
-    for old in ("agreement", "agreement_from", "consistency"):
-        new, _ = RENAMED[old]
-        assert f"{new}:" in written
-        written = re.sub(rf"\b{new}:", f"{old}:", written)
-    (tmp_path / "config.yml").write_text(written)
-    assert load_config(tmp_path / "config.yml") == config
+RELEASED = Path(__file__).parent / "shellgs-metric-0.2.0.yml"
+"""Of a run of shellgs-metric, as 0.2.0 wrote it, the first release."""
 
 
-OLDER = Path(__file__).parent / "shellgs-metric-older.yml"
-"""Of shellgs-metric, before its switches became ``init`` and ``trust``."""
-
-
-def test_an_older_config_of_shellgs_metric_means_what_it_meant():
+def test_a_config_of_the_first_release_means_what_it_meant():
     now = copy.deepcopy(all_methods["shellgs-metric"]).pipeline.model
-    then = replace(now, exposure="fixed", background_color="black")  # there was nothing else
-    assert load_config(OLDER).pipeline.model == then
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ({"seeds": "none"}, {"init": "sfm"}),
-        ({"shell_counts": "everywhere"}, {"trust": "photographs"}),  # as the two others ask for it
-        ({"shell_counts": "everywhere", "geometry_of": "everything", "ignore_transients": "false"}, {"trust": "shell"}),
-        ({"densification": "mcmc"}, {}),
-    ],
-)
-def test_switches_of_an_older_config_are_todays(tmp_path, old, new):
-    text = OLDER.read_text()
-    for name, value in old.items():
-        text, n = re.subn(rf"\b{name}: .*", f"{name}: {value}", text)
-        assert n == 1
-    (tmp_path / "config.yml").write_text(text)
-    assert load_config(tmp_path / "config.yml").pipeline.model == replace(load_config(OLDER).pipeline.model, **new)
-
-
-def test_a_setting_of_another_class_keeps_its_name():
-    """As ``seeds`` would of another plugin."""
-    assert renamed({"seeds": 3}, {"seeds"}) == renamed({"seeds": 3}, set()) == {"seeds": 3}
+    assert load_config(RELEASED).pipeline.model == replace(now, background_color="black")
 
 
 DAMAGE: dict[str, tuple[Callable[[str], str], str]] = {
