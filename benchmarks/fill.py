@@ -33,7 +33,7 @@ from shellgs_method.compare.runs import Run, grid
 from shellgs_method.compare.settings import default_settings
 from shellgs_method.compare.tables import read_metrics
 from shellgs_method.errors import SceneError, refusals_end_the_program
-from shellgs_method.files.atomic import atomic_write, unfinished
+from shellgs_method.files.atomic import unfinished, write_whole
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.launch.local import follow, launch_locally
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
@@ -128,8 +128,7 @@ def _launch(runs: Sequence[Run], here: dict, cells: Mapping[Run, Cell], results:
     for number, run in enumerate(runs, 1):
         console.print(f"[bold]{cells[run].label}, {number} of {len(runs)}", highlight=False)
         if not (run.folder / ORIGIN).exists():
-            with atomic_write(run.folder / ORIGIN) as file:
-                file.write(json.dumps(here).encode())
+            write_whole(run.folder / ORIGIN, json.dumps(here))
         failures |= launch_locally([run], 1, console)
         if run.finished:
             _save_run(run, cells[run], results)
@@ -153,8 +152,7 @@ def save(cell: Cell, metrics: Mapping[str, float], settings: Mapping, origin: Ma
     rounded = {key: round(value, DIGITS) for key, value in sorted(metrics.items())}
     record = {**cell.identity, **origin, "settings": settings, "metrics": rounded}
     cell.file(results).parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(cell.file(results)) as file:
-        file.write((json.dumps(record, indent=1) + "\n").encode())
+    write_whole(cell.file(results), json.dumps(record, indent=1) + "\n")
 
 
 def prepared(scene: str, setting: Setting, work: Path, data: Path | None) -> Path:

@@ -28,7 +28,7 @@ from tyro.conf import Suppress
 
 from shellgs_method.bounds import Rate
 from shellgs_method.errors import INTERRUPTED, SceneError, refusals_end_the_program
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.gaussians.pruning import broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.interrupts import at_interrupt
@@ -125,8 +125,7 @@ class FacadeTrainerConfig(TrainerConfig):
                     f"another training, which may have begun in the same second, writes to {folder}: begin again, or "
                     "name the folder by --timestamp"
                 )
-            with atomic_write(folder / "config.yml") as file:
-                file.write(written_config(self).encode())
+            write_whole(folder / "config.yml", written_config(self))
         tell("Reading the scene")
 
 

@@ -42,15 +42,14 @@ def report_seams(config: Path, coarse: Path) -> None:
     """
     from shellgs_method.blocks.seams import DOUBLES, NEAR, along_cuts, doubles, judged
     from shellgs_method.export.runs import TrainedRun
-    from shellgs_method.files.atomic import atomic_write
+    from shellgs_method.files.atomic import write_whole
 
     run = TrainedRun.load(config)
     merged, double = along_cuts(run), doubles(run)
     without = along_cuts(TrainedRun.load(coarse))
     seams, path = judged(merged, without), config.with_name("seams.json")
     found = merged | {"doubles": double, "coarse": without, "lost": {seam.criterion.key: seam.lost for seam in seams}}
-    with atomic_write(path) as file:
-        file.write((json.dumps(found, indent=1) + "\n").encode())
+    write_whole(path, json.dumps(found, indent=1) + "\n")
     # Its headings are short, to fit a terminal of 80 columns.
     near = f"within {NEAR:g} {'m' if run.model.metres_per_unit else 'scene unit'} of one"
     table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")

@@ -26,7 +26,7 @@ from shellgs_method.commands.sim import check_packages
 from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, read_json
+from shellgs_method.files.atomic import content_hash, fingerprint, read_json, write_whole
 from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.runs.folders import held
 
@@ -107,10 +107,7 @@ class Recipe:
             value = getattr(self, field.name)
             if value != field.default:
                 lines.append(_flag(field.name) + ("" if value is True else f" {word(value)}"))
-        with atomic_write(file) as written:
-            written.write(
-                ("# Settings of `shellgs run`: change them, and run it again.\n" + "\n".join(lines) + "\n").encode()
-            )
+        write_whole(file, "\n".join(["# Settings of `shellgs run`: change them, and run it again.", *lines, ""]))
 
     def check(self) -> None:
         """Refuse what would fail hours later.
@@ -275,8 +272,7 @@ class _Steps:
     def done(self, step: str, *inputs: object) -> None:
         """Note that it was."""
         self._done[step] = fingerprint(*inputs)
-        with atomic_write(self._path) as file:
-            file.write(json.dumps(self._done, indent=1).encode())
+        write_whole(self._path, json.dumps(self._done, indent=1))
 
 
 def _settled(recipe: Recipe, file: Path) -> Recipe:

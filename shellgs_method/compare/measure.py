@@ -26,7 +26,7 @@ from shellgs_method.evaluation.regions import REFERENCES, masked_image_errors, r
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.surveyed import REACH, at_surveyed, read_surveyed
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_write, write_whole
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.gaussians.seeds import photograph_of
@@ -222,6 +222,5 @@ def write_metrics(
         surveyed["surveyed"] = at_surveyed(run, run.surface(REACH), read)
     measured = measure(config, half, renders) | surveyed
     output.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(output) as file:
-        file.write(json.dumps(measured, indent=2, default=vars).encode())
+    write_whole(output, json.dumps(measured, indent=2, default=vars))
     return measured

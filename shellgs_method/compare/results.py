@@ -17,7 +17,7 @@ from shellgs_method.compare.runs import DamagedRunError, Run
 from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.tables import rich_table
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.runs.folders import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
@@ -110,8 +110,7 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
     opening = _opening([*runs, *failures])
     for table in all_tables:
         table.save(output / "tables")
-    with atomic_write(output / "results.md") as file:
-        file.write("\n".join([f"{opening}\n", *(table.markdown for table in all_tables)]).encode())
+    write_whole(output / "results.md", "\n".join([f"{opening}\n", *(table.markdown for table in all_tables)]))
     figures: dict[str, Path] = {}
     shown: dict[str, list[Run]] = {}
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):

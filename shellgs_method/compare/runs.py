@@ -18,7 +18,7 @@ from dataparsers.facade import read_views
 from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.holdout import Half
-from shellgs_method.files.atomic import atomic_write, fingerprint, recover_folder
+from shellgs_method.files.atomic import fingerprint, recover_folder, write_whole
 from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
 from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
@@ -292,8 +292,7 @@ class Run:
                 self.metrics(half).unlink(missing_ok=True)
         if not self.begun:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(self.recorded) as file:
-                file.write(json.dumps(self.settings, indent=2).encode())
+            write_whole(self.recorded, json.dumps(self.settings, indent=2))
 
     @property
     def recorded(self) -> Path:

@@ -25,7 +25,7 @@ from shellgs_method.evaluation.tables import (
     latex_table,
     markdown_table,
 )
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 
 _BY_KEY = {column.key: column for column in (*MAIN_COLUMNS, *SURFACE_COLUMNS)}
 _GEOMETRY = ("depth_mae_m", "normal_deg", "normal_below_10deg", "normal_below_20deg", "depth_normal_deg", "chamfer_m")
@@ -91,8 +91,7 @@ class MetricsTable:
             "json": json.dumps(everything, indent=2),
         }
         for suffix, text in texts.items():
-            with atomic_write(folder / f"{self.name}.{suffix}") as file:
-                file.write(text.encode())
+            write_whole(folder / f"{self.name}.{suffix}", text)
 
 
 def read_metrics(path: Path) -> dict[str, float] | None:

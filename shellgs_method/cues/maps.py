@@ -15,7 +15,7 @@ from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_dispa
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.atomic import content_hash, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.map_files import is_number
@@ -165,8 +165,7 @@ class Fits:
         """Add the fit of a view and save the file."""
         bound = {"camera": _camera_of(view), "photograph": content_hash(view.image)}
         self.views[view.name] = None if fit is None else {**asdict(fit), "problem": fit.problem, **bound}
-        with atomic_write(self.path) as file:
-            file.write((json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n").encode())
+        write_whole(self.path, json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n")
 
     def is_of(self, view: View) -> bool:
         """Whether the fit of a view is of the photograph that it has now: another may have taken its name."""

@@ -21,7 +21,7 @@ from PIL import Image, TiffImagePlugin, TiffTags
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import depth_colours, deviation_colours
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.files.atomic import atomic_write, read_json
+from shellgs_method.files.atomic import atomic_write, read_json, write_whole
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.geometry.triangles import Triangles
@@ -197,7 +197,7 @@ def write_elevation(folder: Path, name: str, elevation: Elevation) -> None:
     left, _, _, top = elevation.extent
     half = elevation.pixel / 2
     numbers = elevation.pixel, 0.0, 0.0, -elevation.pixel, left + half, top - half
-    world = "".join(f"{number:.9g}\n" for number in numbers).encode()
+    world = "".join(f"{number:.9g}\n" for number in numbers)
     maps = {
         f"{name}.png": elevation.colours,
         f"{name}.tif": elevation.colours,
@@ -212,8 +212,7 @@ def write_elevation(folder: Path, name: str, elevation: Elevation) -> None:
             else:
                 tags = _geotiff_tags(elevation, f"{name}, metres along the wall and upwards")
                 Image.fromarray(values).save(file, format="TIFF", tiffinfo=tags, compression="tiff_adobe_deflate")
-        with atomic_write(path.with_suffix({".png": ".pgw", ".tif": ".tfw"}[path.suffix])) as file:
-            file.write(world)
+        write_whole(path.with_suffix({".png": ".pgw", ".tif": ".tfw"}[path.suffix]), world)
     with atomic_write(folder / f"{name}.pdf") as file, PdfPages(file) as pages:
         for title, image in _drawings(elevation).items():
             pages.savefig(_sheet(elevation, f"{name}, {title}", image))

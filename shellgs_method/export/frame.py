@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.geometry.axes import name_of, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of
@@ -74,8 +74,7 @@ class Frame:
     def describe(self, path: Path, facts: dict) -> None:
         """Write a .json that describes the coordinates in this frame, with ``facts`` added."""
         description = self.properties | {"to_scene": self.to_scene.tolist()} | facts
-        with atomic_write(path) as file:
-            file.write((json.dumps(description, indent=1) + "\n").encode())
+        write_whole(path, json.dumps(description, indent=1) + "\n")
 
 
 def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, " 3"] = Z) -> Frame:

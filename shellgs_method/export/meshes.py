@@ -10,7 +10,7 @@ from jaxtyping import Float32
 
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.export.frame import Frame
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.transfer import linear_of
 from shellgs_method.files.usd import USD_FORMATS, add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.axes import name_of, turn
@@ -56,8 +56,7 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
         _write_usd(path, mesh, "y" if name_of(up) == "y" else "z", frame.metric)
     else:
         content: Any = _glb(mesh) if format == ".glb" else mesh.export(file_type=format[1:])
-        with atomic_write(path) as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+        write_whole(path, content)
     about = {"up_in_file": name_of(up), "faces": len(mesh.faces)}
     about |= {"unit_in_file": "metre"} if format in METRE_FORMATS else {}
     frame.describe(Path(f"{path}.json"), about | mesh.metadata | (facts or {}))

@@ -41,6 +41,12 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         temporary.unlink(missing_ok=True)
 
 
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file, text in UTF-8, that is renamed to ``path`` once it is complete."""
+    with atomic_write(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
 def unfinished(path: Path, suffix: str = "") -> Path:
     """Temporary path of a file or folder until it is complete; leftovers of killed processes are deleted.
 
@@ -169,8 +175,7 @@ def _file_hash(path: Path) -> str:
     if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > _SETTLED:
         with suppress(OSError):  # a cache on a full disk or of another user
             known.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(known) as file:
-                file.write(json.dumps({"state": state, "sha256": sha256}).encode())
+            write_whole(known, json.dumps({"state": state, "sha256": sha256}))
     return sha256
 
 

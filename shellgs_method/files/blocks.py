@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, fingerprint, read_json
+from shellgs_method.files.atomic import fingerprint, read_json, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.frames import Frame
 from shellgs_method.geometry.similarity import scale_of
@@ -182,8 +182,7 @@ class Blocks:
             "cameras": self.cameras.to_json(),
         }
         text = _NUMBERS.sub(lambda numbers: json.dumps(json.loads(numbers[0])), json.dumps(contents, indent=1))
-        with atomic_write(path) as file:
-            file.write((text + "\n").encode())
+        write_whole(path, text + "\n")
 
     @classmethod
     def read(cls, path: Path, moved: bool = False) -> Blocks:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, read_json, remove_leftovers
+from shellgs_method.files.atomic import content_hash, fingerprint, read_json, remove_leftovers, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.map_files import (
     FORMAT,
@@ -164,8 +164,7 @@ class CueMaps:
     def _write_manifest(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.folder)
-        with atomic_write(self.folder / "manifest.json") as file:
-            file.write(json.dumps(asdict(self.manifest), indent=1).encode())
+        write_whole(self.folder / "manifest.json", json.dumps(asdict(self.manifest), indent=1))
 
     @property
     def folder(self) -> Path:

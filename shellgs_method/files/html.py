@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 
 _STYLE = """
 :root { color-scheme: light }
@@ -42,8 +42,7 @@ def write_page(path: Path, title: str, body: Iterable[str], style: str = "") -> 
     """
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>'
     page = f"{head}<style>{_STYLE}{style}</style><h1>{escape(title)}</h1>\n{''.join(body)}"
-    with atomic_write(path) as file:
-        file.write(page.encode())
+    write_whole(path, page)
 
 
 def table(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:

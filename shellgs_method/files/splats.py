@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from shellgs_method.errors import SceneError, check_output, notice
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.splats_page import splats_page
 from shellgs_method.geometry.camera import Camera
 
@@ -131,8 +131,7 @@ def write_splats(
             f"{path} would have {len(content) / 1e6:.0f} MB, more than browsers read: give --megabytes {LARGEST_PAGE}"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as file:
-        file.write(content)
+    write_whole(path, content)
     return len(splats)
 
 

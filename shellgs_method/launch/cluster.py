@@ -31,7 +31,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, fingerprint, replace_folder, unfinished
+from shellgs_method.files.atomic import fingerprint, replace_folder, unfinished, write_whole
 from shellgs_method.launch.display import Display
 from shellgs_method.launch.job import Job, JobT
 from shellgs_method.launch.local import BIN, CommandError, finish
@@ -359,8 +359,7 @@ def _set_paths_in_config(run: Job) -> None:
             config = open_run(config_path, find_scene=False)
             config.data = config.pipeline.datamanager.data = run.scene
             config.output_dir, config.load_dir = run.output / "runs" / run.scene.name, None
-            with atomic_write(config_path) as file:
-                file.write(written_config(config).encode())
+            write_whole(config_path, written_config(config))
 
 
 class _Pieces(io.RawIOBase):

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float64, Int64
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.cue_maps import CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
@@ -82,9 +83,8 @@ class Verdicts:
         """Write the points as a ply, redder where a larger share of the views contradicts them."""
         red = self.contradicted / np.maximum(self.seen, 1)
         colours = 255 - 255 * red[:, None] * [0.1, 1, 1]
-        content = trimesh.PointCloud(self.places, colours.round().astype(np.uint8)).export(file_type="ply")
-        with atomic_write(path) as file:
-            file.write(content if isinstance(content, bytes) else str(content).encode())
+        content: Any = trimesh.PointCloud(self.places, colours.round().astype(np.uint8)).export(file_type="ply")
+        write_whole(path, content)
 
 
 def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarray, "N 3"] | None = None) -> Verdicts:

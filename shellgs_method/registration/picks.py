@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.paths import folded
 from shellgs_method.files.photographs import View, to_camera, upright_size
 from shellgs_method.files.tables import IMAGE, NAME, PIXELS, Table, words_of
@@ -195,8 +195,7 @@ class PicksFile:
                 shell = " ".join(map(repr, pick.shell.tolist()))
                 for name, (x, y) in pick.pixels.items():
                     lines.append(f"{mark}{shell}   {x:.2f} {y:.2f}   {_quoted(called[name])}   {_quoted(pick.name)}")
-        with atomic_write(path) as file:
-            file.write("\n".join([*lines, ""]).encode())
+        write_whole(path, "\n".join([*lines, ""]))
 
 
 def _quoted(word: str) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.files.photographs import View, load_photograph
@@ -85,14 +85,14 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
     for name, figure in (("distances", _histogram(validation)), ("shifts", _shifts(validation))):
         if figure is not None:
             plots[name] = _png(figure)
-            _write(folder / f"{name}.png", plots[name])
+            write_whole(folder / f"{name}.png", plots[name])
     overlays = list(_overlays(folder, mesh, validation))
     record = {
         "verdict": validation.verdict,
         "checks": [vars(check) for check in validation.checks],
         "metrics": validation.metrics(),
     }
-    _write(folder / "validation.json", (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
+    write_whole(folder / "validation.json", json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     title = f"Alignment of {validation.alignment.named}: {validation.verdict}"
     body = _body(validation, history, plots, overlays)
     write_page(folder / "index.html", title, body, ".layers:hover img + img { opacity: 0 }")
@@ -124,7 +124,7 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
             composite[old], lines[old] = _EDGE_BEFORE, (*_EDGE_BEFORE, 255)
         composite[edges], lines[edges] = _EDGE, (*_EDGE, 255)
         name = f"view_{number}_{Path(view.name).stem}.png"
-        _write(folder / name, encoded(composite))
+        write_whole(folder / name, encoded(composite))
         layers = img(encoded(photograph, "JPEG"), view.name) + img(encoded(lines), "the shell's edges")
         caption = f"{escape(view.name)}, {support.supported:.0%} on the shell"
         yield captioned(f'<div class="layers">{layers}</div>', caption)
@@ -291,8 +291,3 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def _write(path: Path, data: bytes) -> None:
-    with atomic_write(path) as file:
-        file.write(data)

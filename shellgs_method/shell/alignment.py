@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, content_hash, read_json, remove_leftovers
+from shellgs_method.files.atomic import content_hash, read_json, remove_leftovers, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
@@ -215,9 +215,8 @@ class Alignment:
         """Write the alignment as json."""
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(path.parent)
-        with atomic_write(path) as file:
-            lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
-            file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
+        lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
+        write_whole(path, "{\n " + ",\n ".join(lines) + "\n}\n")
 
     def record(self, path: Path, views: Sequence[View]) -> None:
         """Write a file of the alignment, bound to the cameras of views; one that says the same keeps its verdict."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.atomic import atomic_write, content_hash, write_whole
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.readers.contents import Geometry, refuse_degrees
 from shellgs_method.files.readers.points import NO_POINTS
@@ -168,8 +168,7 @@ def _write_cached(mesh: ShellMesh, cached: Path, source: Path, made_for: dict[st
     header += [*(f"property double {axis}" for axis in "xyz"), f"element face {len(faces)}"]
     header += ["property list uchar int vertex_indices", "end_header\n"]
     cached.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(cached) as file:
-        file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
+    write_whole(cached, "\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
 def _read_cached(cached: Path, source: Path, cameras: Sequence[Camera], spacing: float | None) -> ShellMesh | None:
