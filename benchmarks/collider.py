@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
 from benchmarks.walls import eyes_before, wall_with_bays
-from shellgs_method.files.colmap import ColmapImage, read_model
+from shellgs_method.files.colmap import read_model
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.shell import load_shell
@@ -73,13 +72,9 @@ def _scanned(scene: Path) -> tuple[str, Triangles, np.ndarray]:
     (path,) = (scene / "shell").glob("*.ply")
     mesh, to_scene = load_shell(path), np.loadtxt(scene / "shell/shell_to_scene.txt")
     images = read_model(scene / "colmap/sparse/0").images.values()
-    eyes = transformed(np.stack([_position(each) for each in images]), np.linalg.inv(to_scene))
+    eyes = transformed(np.stack([each.centre for each in images]), np.linalg.inv(to_scene))
     middle = np.round(mesh.vertices.mean(axis=0))
     return scene.name, Triangles(mesh.vertices - middle, mesh.faces), eyes - middle
-
-
-def _position(image: ColmapImage) -> np.ndarray:
-    return -Rotation.from_quat(image.quaternion, scalar_first=True).inv().apply(image.translation)
 
 
 if __name__ == "__main__":

@@ -71,6 +71,16 @@ class ColmapImage(NamedTuple):
     keypoints: np.ndarray | str
 
     @property
+    def rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """The rotation from the world's axes to the camera's."""
+        return Rotation.from_quat(np.roll(self.quaternion, -1)).as_matrix()
+
+    @property
+    def centre(self) -> Float64[np.ndarray, " 3"]:
+        """The camera's place in the world."""
+        return -self.rotation.T @ self.translation
+
+    @property
     def features(self) -> np.ndarray:
         """Pixel ``xy`` and id of the ``point``, or -1, of each keypoint.
 
@@ -253,11 +263,8 @@ def _frame(scene: Path, path: str, image: ColmapImage, cameras: Mapping[int, Col
     quaternion = np.array(image.quaternion)
     if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
-    viewmat[:3, 3] = image.translation
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = viewmat[:3, :3].T, -viewmat[:3, :3].T @ viewmat[:3, 3]
+    pose[:3, :3], pose[:3, 3] = image.rotation.T, image.centre
     return frame(scene, path, pose, _lens(camera, scene), where)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.triangles import stacked
 from shellgs_method.machine.open3d import import_open3d
 from shellgs_method.machine.progress import track
 
@@ -229,15 +230,10 @@ def _joined(parts: list[tuple[trimesh.Trimesh, Bool[np.ndarray, " F"]]]) -> trim
 
     if len(parts) == 1:
         return parts[0][0]
-    vertices, faces, colours, count = [], [], [], 0
-    for mesh, chosen in parts:
-        vertices.append(mesh.vertices)
-        faces.append(mesh.faces[chosen] + count)
-        colours.append(np.asarray(mesh.visual.vertex_colors)[:, :3])  # pyright: ignore
-        count += len(mesh.vertices)
-    places, first, index = np.unique(np.concatenate(vertices), axis=0, return_index=True, return_inverse=True)
-    shades = np.concatenate(colours)[first]
-    return trimesh.Trimesh(places, index[np.concatenate(faces)], vertex_colors=shades, process=False)
+    vertices, faces = stacked((mesh.vertices, mesh.faces[chosen]) for mesh, chosen in parts)
+    colours = np.concatenate([np.asarray(mesh.visual.vertex_colors)[:, :3] for mesh, _ in parts])  # pyright: ignore
+    places, first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    return trimesh.Trimesh(places, index[faces], vertex_colors=colours[first], process=False)
 
 
 def _in_order(

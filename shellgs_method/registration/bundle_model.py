@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.colmap import ColmapCamera, ColmapImage, Model, parameters_of
+from shellgs_method.files.colmap import ColmapCamera, Model, parameters_of
 from shellgs_method.geometry.distortion import PARAMETERS
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.registration.bundle import Bundle, Observations
@@ -52,9 +52,8 @@ def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle,
     """
     numbers = {number: k for k, number in enumerate(model.images)}
     scale = scale_of(placed)
-    poses = [_pose(image) for image in model.images.values()]
-    rotations = np.stack([rotation for rotation, _ in poses])
-    centres = np.stack([-rotation.T @ translation for rotation, translation in poses])
+    rotations = np.stack([image.rotation for image in model.images.values()])
+    centres = np.stack([image.centre for image in model.images.values()])
     lenses, free, margins = zip(*map(_lens, model.cameras.values()), strict=True)
     width = max(columns.shape[1] for columns in free)
     lens, margin = np.stack(lenses), np.stack(margins)
@@ -98,11 +97,6 @@ def _tracks(model: Model, numbers: dict[int, int]) -> tuple[np.ndarray, np.ndarr
     if not kept.any():
         raise SceneError("the photographs have no keypoints, without which cameras cannot be adjusted")
     return views[kept], points[kept], pixels[kept]
-
-
-def _pose(image: ColmapImage) -> tuple[np.ndarray, np.ndarray]:
-    quaternion = np.array(image.quaternion)
-    return Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix(), np.array(image.translation)
 
 
 def _lens(camera: ColmapCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
