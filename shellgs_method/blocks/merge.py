@@ -18,8 +18,9 @@ from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.compare.settings import config_settings
 from shellgs_method.errors import SceneError, check_output_folder
 from shellgs_method.files.atomic import atomic_contents
-from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.photographs import View
 from shellgs_method.gaussians.surroundings import Region
 from shellgs_method.machine.progress import tell, track
 from shellgs_method.runs.checkpoints import (
@@ -82,6 +83,29 @@ class BlockRun:
         """The config.yml of the coarse run that it started from."""
         return config_of(self.config.pipeline.model.coarse)  # pyright: ignore[reportAttributeAccessIssue]
 
+    def trained(self, cell: Cell, coarse: CoarseRun, views: Sequence[View]) -> dict[str, Any]:
+        """What its checkpoint holds of the model.
+
+        Raises:
+            SceneError: it was trained with other cameras, in another cell, or from another coarse run.
+        """
+        state = load_checkpoint(self.checkpoint)["pipeline"]
+        extra = state.pop("_extra_state", {})
+        block = extra.get("block", {})
+        if changed := BoundCameras.from_json(extra.get("cameras", {})).changed(views):
+            raise SceneError(
+                f"the cameras of {self.dataparser.data} have changed since {self.folder} was trained: {changed}; train "
+                "again"
+            )
+        if block.get("region") != cell.fingerprint:
+            raise SceneError(f"{self.name} was cut anew since its run {self.folder} was trained: train it again")
+        if block.get("coarse") != coarse.hash:
+            raise SceneError(
+                f"{self.folder} started from another coarse run than {self.coarse.parent}, or from this one before it "
+                "was trained again: train it again"
+            )
+        return state
+
 
 def merge(paths: Sequence[Path], output: Path) -> Path:
     """Merge runs of all blocks of a scene: the Gaussians of each block's core, and the coarse run's where it is far.
@@ -120,21 +144,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     points, to_world = parsed.metadata["points3D_xyz"].double().numpy(), scene_to_world(parsed)
     parts, state = [], {}
     for cell in track(blocks.cells, "Merging block", len(blocks.cells)):
-        run = by_name[cell.block.name]
-        state = load_checkpoint(run.checkpoint)["pipeline"]
-        extra = state.pop("_extra_state", {})
-        trained_as = extra.get("block", {})
-        if changed := BoundCameras.from_json(extra.get("cameras", {})).changed(parsed.metadata["views"]):
-            raise SceneError(
-                f"the cameras of {scene} have changed since {run.folder} was trained: {changed}; train again"
-            )
-        if trained_as.get("region") != cell.fingerprint:
-            raise SceneError(f"{run.name} was cut anew since its run {run.folder} was trained: train it again")
-        if trained_as.get("coarse") != coarse.hash:
-            raise SceneError(
-                f"{run.folder} started from another coarse run than {first.coarse.parent}, or from this one before it "
-                "was trained again: train it again"
-            )
+        state = by_name[cell.block.name].trained(cell, coarse, parsed.metadata["views"])
         region = Region.of(cell.moved(to_world), parsed.metadata["centre"], points)
         gaussians = gaussians_in(state)
         parts.append({name: values[region.core(gaussians["means"])] for name, values in gaussians.items()})

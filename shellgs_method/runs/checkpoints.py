@@ -139,7 +139,7 @@ def load_into(pipeline: Pipeline, path: Path, state: Mapping[str, Any]) -> None:
 def guard_checkpoint_loading() -> None:
     """Make nerfstudio's own commands load checkpoints as ours do.
 
-    Theirs report a damaged one with a page of torch's text, and run the code of a pickle where torch is older than 2.6.
+    Theirs report a damaged one with a page of torch's text.
     """
     from nerfstudio.utils import eval_utils  # imports the methods, and so this module
 
