@@ -18,7 +18,7 @@ from PIL import Image
 from scenes import write_colmap
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.datamanager import FacadeDataset
+from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, load_photograph

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig
-from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig, FacadeDataset
+from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
+from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
 from shellgs_method.evaluation.holdout import Half

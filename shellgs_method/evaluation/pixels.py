@@ -1,6 +1,6 @@
 """Which pixels of a view count: for the photometric loss, for losses against a cue, and for metrics.
 
-A batch is nerfstudio's dictionary of a view, as :class:`~shellgs_method.datamanager.FacadeDataset` makes it.
+A batch is nerfstudio's dictionary of a view, as :class:`~shellgs_method.dataset.FacadeDataset` makes it.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float32, Float64
 from torch import Tensor
 
-from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
+from shellgs_method.datamanager import FacadeDataManager
+from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.regions import reference_errors

@@ -25,7 +25,7 @@ from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as
 from shellgs_method.cues.maps import Fits, MonoSummary, make_maps
 from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, gradient_normals, to_opencv
 from shellgs_method.cues.source import Prediction, Predictor
-from shellgs_method.datamanager import FacadeDataset
+from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View

@@ -22,7 +22,7 @@ from scenes import parse, write_colmap
 
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.datamanager import FacadeDataset
+from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
 from shellgs_method.files.photographs import load_photograph
