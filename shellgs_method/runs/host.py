@@ -107,9 +107,27 @@ def _camera_path(file: TextIO) -> dict[str, Any]:
                 raise SceneError(f"{file.name}: the camera_to_world of each camera must be 16 finite numbers")
             if angled:
                 _number_between(camera, "fov", 0, 180, file.name)
+        if path.get("crop") is not None:
+            path["crop"] = _crop(path["crop"], file.name)
         if not path.get("seconds"):  # of a single keyframe, or of other programs
             path["seconds"] = len(cameras) / (path.get("fps") or 24)
     return path
+
+
+def _crop(crop: Any, where: str) -> dict[str, Any]:
+    """The crop box of a camera path, in floats: ns-render makes no rotation of whole numbers."""
+    try:
+        given: dict[str, Any] = {"crop_rot": [0, 0, 0]} | dict(crop)
+        parts = {name: np.array(given[name], np.float64) for name in ("crop_center", "crop_scale", "crop_rot")}
+        colour = {band: float(given["crop_bg_color"][band]) for band in "rgb"}
+        if any(part.shape != (3,) or not np.isfinite(part).all() for part in parts.values()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{where}: its crop must have a crop_center, crop_scale and crop_rot of three numbers each, and a "
+            "crop_bg_color of r, g and b; leave it out to render all"
+        ) from error
+    return {name: part.tolist() for name, part in parts.items()} | {"crop_bg_color": colour}
 
 
 def _number_between(numbers: dict[str, Any], name: str, low: float, high: float, where: str) -> None:

@@ -85,6 +85,11 @@ PATHS: dict[str, tuple[dict[str, Any], str]] = {
     "half around": ({"camera_path": [{"camera_to_world": POSE, "fov": 180}]}, "below 180, and is 180"),
     "three rows": ({"camera_path": [{"camera_to_world": POSE[:12], "fov": 50}]}, "must be 16 finite numbers"),
     "a folder": ({"camera_path": ["data/images"]}, "must be 16 finite numbers"),
+    "a crop without a colour": (
+        {"crop": {"crop_center": [0, 0, 0], "crop_scale": [1, 1, 1]}},
+        "a crop_bg_color of r, g",
+    ),
+    "a flat crop": ({"crop": NOWHERE | {"crop_scale": [1, 1]}}, "crop_rot of three numbers each"),
     "no width": ({"render_width": None}, "render_width must be a number above 0"),
 }
 
@@ -105,8 +110,9 @@ def test_a_path_may_leave_out_its_length_and_write_its_type_otherwise(loaded, tm
     np.testing.assert_array_equal(image, same)
 
 
-def test_a_crop_box_around_nothing_shows_the_background(loaded, tmp_path):
-    path = camera_path(tmp_path, crop=NOWHERE)
+@pytest.mark.parametrize("turn", [{}, {"crop_rot": [0, 0, 0]}])
+def test_a_crop_box_around_nothing_shows_the_background(loaded, tmp_path, turn):
+    path = camera_path(tmp_path, crop=NOWHERE | turn)  # whole numbers too, of which viser makes no rotation
     (image,) = images_along(path, tmp_path, rendered_output_names=["rgb", "normal", "background"])
     assert image.shape == (16, 96, 3)
     assert (image[:, :32] == [255, 0, 0]).all()  # the path's crop_bg_color
