@@ -88,7 +88,7 @@ class Recipe:
             SceneError: a quote is not closed, or it is no text.
         """
         try:
-            words = shlex.split(file.read_text(), comments=True)
+            words = shlex.split(file.read_text("utf-8-sig"), comments=True)  # whatever Windows' language is
         except ValueError as error:
             raise SceneError(f"{file} cannot be read ({error}): correct it") from error
         return tyro.cli(cls, args=words, prog=str(file)).located(lambda path: file.parent / path)

@@ -155,6 +155,17 @@ def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path)
     assert Recipe.load(moved / "scene.run").sources == (moved / "walk by.mp4", Path("/elsewhere/scan.ply"))
 
 
+def test_settings_that_notepad_saved_are_read_in_any_language(tmp_path, monkeypatch):
+    """As UTF-8 with a byte order mark, which was taken for a path, and not in the code page of Windows."""
+    recipe = Recipe(sources=(tmp_path / "Gebäude/walk.mp4", tmp_path / "scan.ply"))
+    recipe.save(tmp_path / "scene.run")
+    saved = (tmp_path / "scene.run").read_text("utf-8")
+    (tmp_path / "scene.run").write_bytes(saved.replace("\n", "\r\n").encode("utf-8-sig"))
+    in_latin_1 = lambda path, encoding="latin-1", *_: path.read_bytes().decode(encoding)  # noqa: E731
+    monkeypatch.setattr(Path, "read_text", in_latin_1)
+    assert Recipe.load(tmp_path / "scene.run") == recipe
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [
