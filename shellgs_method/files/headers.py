@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import struct
+from codecs import BOM_UTF8
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +82,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     with path.open("rb") as file:
         start = file.read(_LONGEST_HEADER)
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|.|$)", start, re.DOTALL)
-    if not start.startswith(b"ply") or not end:
+    if not start.removeprefix(BOM_UTF8).startswith(b"ply") or not end:
         raise ValueError("it does not begin with the header of a PLY")
     text, length = start[: end.start()], end.end()
     order, elements = "", []
@@ -104,6 +105,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     if any(element.count < 0 for element in elements):
         raise ValueError("its header has a negative count")
     if order is None:
+        length += len(BOM_UTF8) * start.startswith(BOM_UTF8, length)
         _check_lines(path, length, elements)
     elif (claimed := length + sum(_least_bytes(element) for element in elements)) > path.stat().st_size:
         raise ValueError(f"its header claims at least {claimed} bytes, but it has {path.stat().st_size}")

@@ -473,6 +473,20 @@ def test_a_drawing_of_lines_is_no_cloud_of_their_ends(tmp_path: Path, suffix: st
         read_geometry(path)
 
 
+@pytest.mark.parametrize("where", ["ply", "5 0 0"])
+@pytest.mark.parametrize("faces", [0, 1])
+def test_a_text_ply_may_have_a_byte_order_mark(tmp_path: Path, where: str, faces: int):
+    """Before its header or its numbers, as .NET's writers and editors on Windows put it."""
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"element face {faces}", "property list uchar int vertex_indices", "end_header"]
+    text = "\n".join([*lines, "5 0 0", "1 0 0", "0 2 0", *["3 0 1 2"] * faces, ""])
+    at = text.index(where)
+    (tmp_path / "a.ply").write_text(text[:at] + "\ufeff" + text[at:], "utf-8")
+    read = read_geometry(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.vertices, [[5, 0, 0], [1, 0, 0], [0, 2, 0]])
+    assert len(read.faces) == faces
+
+
 def test_blank_lines_after_the_points_of_a_ply_are_no_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(ply, "_TEXT", 8)  # bytes read at once: blanks alone are
     header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz")]
