@@ -44,7 +44,7 @@ LOW = 0.25
 """Quantile of the heights of a cell's points that is the ground's: others are of what stands there."""
 STEADY = 100.0
 """Spread of the ground that halves a slope, as the sum over its square metres of their squared distance from its middle
-along an axis: that of 10 square metres over 10 metres."""
+along that slope: that of 10 square metres over 10 metres."""
 LEAST = 5.0
 """Area in square metres, measured, below which the ground is taken for level at height 0."""
 STREETS = 3
@@ -260,7 +260,7 @@ class _Street:
 
 
 def _streets(points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], grid: _Grid) -> Iterator[_Street]:
-    """Level surfaces that are begun below cameras, that of most points first."""
+    """Level surfaces that are begun below cameras, that of most points first, each of points that those before lack."""
     for _ in range(STREETS):
         if below.sum() < 3:
             return
@@ -268,7 +268,8 @@ def _streets(points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], 
         if street.area < LEAST:
             return
         yield street
-        below = below & (np.abs(points[:, 2] - street.nearest.ravel()[grid.cells(points)]) > BAND)
+        left = np.abs(points[:, 2] - street.nearest.ravel()[grid.cells(points)]) > BAND
+        points, below = points[left], below[left]
 
 
 def _stood_on(streets: list[_Street], eyes: Float64[np.ndarray, "E 3"], grid: _Grid) -> list[_Street]:
@@ -297,7 +298,8 @@ def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
         return spread[:, 2] - spread[:, :2] @ plane[:2] - plane[2]
 
     slope = least_squares(off, np.zeros(3), loss="cauchy", f_scale=0.1).x
-    slope[:2] *= 1 / (1 + STEADY / np.square(spread[:, :2]).sum(axis=0).clip(1e-9))  # few points do not show a slope
+    scatter = spread[:, :2].T @ spread[:, :2]
+    slope[:2] = np.linalg.solve(scatter + STEADY * np.eye(2), scatter @ slope[:2])  # few points do not show a slope
     return np.array([slope[0], slope[1], middle[2] + slope[2] - slope[:2] @ middle[:2]])
 
 

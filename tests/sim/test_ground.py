@@ -18,7 +18,7 @@ from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.world import write_world
-from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground
+from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground, _Grid, _streets
 from shellgs_method.sim.trials.engine import lidar
 
 EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
@@ -80,7 +80,7 @@ def test_the_ground_goes_on_below_cars_and_beside_a_street_that_is_no_plane():
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-28, 28, 200), np.linspace(-8, 8, 60)))
     off = np.abs(made.at(np.stack([x, y], axis=1)) - 0.08 * np.maximum(x, 0))
     assert off[np.abs(y) < 6].max() < 0.1
-    assert off.max() < 0.2
+    assert off.max() < 0.35
 
 
 def test_a_hill_is_one_street_in_the_large_cells_of_a_large_site(monkeypatch):
@@ -114,6 +114,29 @@ def test_a_small_slope_beside_the_wall_does_not_tilt_the_street(size):
     made = Ground.of(np.stack([x, y - 4, 0.08 * x + rng.normal(0, 0.005, 4000)], axis=1), EYES)
     assert np.abs(made.at(np.array([[-15.0, -4], [15, -4], [0, -20]]))).max() < 0.35
     assert made.is_level == (size**2 < LEAST)
+
+
+def turned(points: np.ndarray, degrees: float) -> np.ndarray:
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 45])
+def test_a_strip_along_the_wall_does_not_tilt_the_street_whatever_way_the_wall_runs(degrees):
+    """Walls rarely run along an axis of national coordinates: a gutter of 20 % was 1.9 m deep below the cameras."""
+    strip, eyes = level_points((-8, 8), (-1.5, 0), 0.0), EYES - np.array([0, 8, 0])
+    strip[:, 2] += 0.2 * (strip[:, 1] + 0.75)
+    assert np.abs(Ground.of(turned(strip, degrees), turned(eyes, degrees)).at(turned(eyes, degrees))).max() < 0.35
+
+
+def test_a_hedge_above_a_street_does_not_begin_the_street_again_with_the_plane_of_its_top():
+    """Such a plane, of the top alone, lifted the ground to 3 m above the cameras of a walk."""
+    road, pavement = level_points((-8, 8), (-6, -4), 0.0), level_points((-8, 8), (-4, 0), 0.15)
+    hedge = level_points((-8, 8), (-5, -4), 1.04)
+    hedge[:, 2] -= 0.5 * (hedge[:, 1] + 4)
+    points = np.concatenate([road, pavement, hedge])
+    streets = list(_streets(points, points[:, 2] < 1.6, _Grid.around(points[:, :2])))
+    assert sum(np.nanmedian(street.measured) < 0.5 for street in streets) == 1
 
 
 def test_ground_that_is_exactly_flat_has_its_height_in_the_world(tmp_path):
