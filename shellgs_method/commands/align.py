@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import tyro
-from rich.table import Table
 
 from shellgs_method.bounds import Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, table
 from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
@@ -264,10 +263,10 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
         console.print(sentence, highlight=False)
     if placement.correspondences:
         head, *rows = residual_table(placement.correspondences)
-        table = Table(*head)
+        residuals = table(*head)
         for row in rows:
-            table.add_row(*row)
-        console.print(table)
+            residuals.add_row(*row)
+        console.print(residuals)
     for reason in validation.reasons:
         console.print(f"{reason}.", style="yellow", highlight=False)
     if validation.verdict == "refused":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
+from rich.table import Column, Table
 
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.launch.resources import Cluster
@@ -33,6 +34,11 @@ PATHS = ScenePaths()
 ClusterFlags = Annotated[Cluster, tyro.conf.arg(name="")]
 CLUSTER = Cluster()
 Mesher = Literal["planes", "bpa", "poisson"]
+
+
+def table(*headings: str, title: str | None = None) -> Table:
+    """A table that breaks long words in a narrow terminal: rich would cut names of photographs, paths and addresses."""
+    return Table(*(Column(heading, overflow="fold") for heading in headings), title=title)
 
 
 def launch(

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Optional
 
-from rich.table import Table
-
-from shellgs_method.commands.common import RunConfig, console
+from shellgs_method.commands.common import RunConfig, console, table
 
 if TYPE_CHECKING:
     from shellgs_method.export.surveyed import Surveyed
@@ -52,10 +50,10 @@ def _print_surveyed(surveyed: Surveyed) -> None:
     """Print a table of the points, and what the pairs of them say."""
     import numpy as np
 
-    table = Table("Point", "Surface in front of the point (m)")
+    points = table("Point", "Surface in front of the point (m)")
     for name, before in surveyed.before.items():
-        table.add_row(name, "no surface near it" if before is None else f"{before:+.3f}")
-    console.print(table)
+        points.add_row(name, "no surface near it" if before is None else f"{before:+.3f}")
+    console.print(points)
     off = surveyed.distances
     console.print(
         f"The surface is {np.median(off):.3f} m from {len(off)} of {len(surveyed.before)} points in the median, "

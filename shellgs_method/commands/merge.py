@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.table import Table
 from rich.text import Text
 
-from shellgs_method.commands.common import console, required
+from shellgs_method.commands.common import console, required, table
 from shellgs_method.machine.progress import tell
 
 
@@ -52,13 +51,15 @@ def report_seams(config: Path, coarse: Path) -> None:
     write_whole(path, json.dumps(found, indent=1) + "\n")
     # Its headings are short, to fit a terminal of 80 columns.
     near = f"within {NEAR:g} {'m' if run.model.metres_per_unit else 'scene unit'} of one"
-    table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")
+    report = table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")
     for seam in seams:
         good = "good" if seam.good else Text(f"more than {seam.criterion.most:g}", "bold")
-        table.add_row(seam.criterion.title, *(f"{value:.3f}" for value in (seam.near, seam.elsewhere, seam.lost)), good)
+        report.add_row(
+            seam.criterion.title, *(f"{value:.3f}" for value in (seam.near, seam.elsewhere, seam.lost)), good
+        )
     good = "good" if double["share"] <= DOUBLES else Text(f"more than {DOUBLES:.0%}", "bold")
-    table.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
-    console.print(table)
+    report.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
+    console.print(report)
     console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)
     if not seams:
         console.print("No held-out view shows the shell near a cut: the rest is not measured.")

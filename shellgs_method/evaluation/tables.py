@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
@@ -132,8 +132,8 @@ def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[
     return head, lines
 
 
-def rich_table(rows: Rows, columns: Sequence[Column], width: int, title: str | None = None) -> Table:
-    """The table of :func:`markdown_table` for a terminal; where it would be too wide, with a row per metric.
+def rich_table(rows: Rows, columns: Sequence[Column], width: int, title: str | None = None) -> Group:
+    """The table of :func:`markdown_table` for a terminal; too wide for it, it has a row per metric, or is in parts.
 
     Args:
         rows: metrics of the methods.
@@ -145,19 +145,29 @@ def rich_table(rows: Rows, columns: Sequence[Column], width: int, title: str | N
     for method, cells in _cells(rows, columns):
         lines.append([Text(method), *(Text(text, "bold" if best else "") for text, best in cells)])
     (_, *headings), *methods = lines
-    wide, narrow = (
-        _rich(each, title, footnote(rows, columns))
-        for each in (lines, list(zip([Text("Metric"), *headings], *methods, strict=True)))
-    )
-    return wide if _width(wide) <= max(width, _width(narrow)) else narrow
+    turned = list(zip([Text("Metric"), *headings], *methods, strict=True))
+    whole = next((each for each in (lines, turned) if _width(_rich(each)) <= width), None)
+    parts = [_rich(whole)] if whole else list(_parts(lines, width))
+    parts[0].title, parts[-1].caption = title, footnote(rows, columns)
+    return Group(*parts)
 
 
-def _rich(lines: Sequence[Sequence[Text]], title: str | None, caption: str | None) -> Table:
+def _parts(lines: Sequence[Sequence[Text]], width: int) -> Iterator[Table]:
+    """Tables with as many of the columns as fit, of which each has one at least beside the first."""
+    left = range(1, len(lines[0]))
+    while left:
+        fitting = [n for n in left if _width(_rich([[line[0], *line[left[0] : n + 1]] for line in lines])) <= width]
+        end = max(fitting, default=left[0]) + 1
+        yield _rich([[line[0], *line[left[0] : end]] for line in lines])
+        left = range(end, left.stop)
+
+
+def _rich(lines: Sequence[Sequence[Text]]) -> Table:
     (first, *others), *rows = lines
-    table = Table(title=title, caption=caption)
-    table.add_column(first, no_wrap=True)
+    table = Table()
+    table.add_column(first, overflow="fold")
     for heading in others:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -12,10 +13,11 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from rich.console import Console
 
 from shellgs_method import cli
 from shellgs_method.cli import main
-from shellgs_method.commands.common import open_page
+from shellgs_method.commands.common import open_page, table
 from shellgs_method.errors import INTERRUPTED
 from shellgs_method.machine import doctor
 
@@ -244,6 +246,14 @@ def test_a_command_to_be_typed_quotes_a_path_with_blanks(shellgs):
 def test_doctor_lists_the_parts_of_this_machine(tmp_path):
     output = run("doctor", cwd=tmp_path)
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
+
+
+def test_a_table_in_a_narrow_terminal_has_all_of_a_path():
+    output, path = io.StringIO(), "/home/user/.cache/torch/hub/checkpoints/alexnet-owt-7be5be79.pth"
+    listed = table("part", "finding")
+    listed.add_row("LPIPS weights", f"put them at {path}")
+    Console(file=output, width=40).print(listed)
+    assert path in "".join(line.split("│")[2].strip() for line in output.getvalue().splitlines() if "│" in line)
 
 
 def test_doctor_names_the_kind_of_an_error_without_words(monkeypatch):

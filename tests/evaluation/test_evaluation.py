@@ -6,6 +6,7 @@ import io
 import json
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +36,14 @@ from shellgs_method.evaluation import (
 )
 from shellgs_method.evaluation.colours import GREY
 from shellgs_method.evaluation.figures import Panel, save_strip
-from shellgs_method.evaluation.tables import MAIN_COLUMNS, REGION_COLUMNS, Column, markdown_table, rich_table
+from shellgs_method.evaluation.tables import (
+    MAIN_COLUMNS,
+    REGION_COLUMNS,
+    Column,
+    Rows,
+    markdown_table,
+    rich_table,
+)
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.geometry.reference import Reference
@@ -393,7 +401,7 @@ def test_markdown_table_has_the_best_in_bold_and_dashes_for_missing_metrics():
 
 
 def test_terminal_table_has_the_same_cells():
-    table = rich_table(ROWS, COLUMNS, 80)
+    (table,) = rich_table(ROWS, COLUMNS, 80).renderables
     assert [[cell.markup for cell in column.cells] for column in table.columns] == [  # pyright: ignore
         ["shellgs", "photo-gs"],
         ["[bold]25.0[/bold]", "[bold]25.0[/bold]"],
@@ -411,10 +419,24 @@ def test_a_terminal_table_too_wide_for_its_terminal_has_a_row_per_metric_and_wra
     assert all("shell" in column.title for column in REGION_COLUMNS if "_shell" in column.key)
 
 
+def test_a_table_of_many_methods_and_seeds_is_in_parts_that_fit_the_terminal_and_cuts_nothing():
+    seeds = {column.key: (0.1, 0.2, 0.4) for column in MAIN_COLUMNS}
+    methods = ("photo-gs", "2dgs", "mono-gs", "shellgs", "shellgs-metric", "shellgs-plane", "shellgs-2d-empty-space")
+    output = io.StringIO()
+    Console(file=output, width=80).print(rich_table(dict.fromkeys(methods, seeds), MAIN_COLUMNS, 80))
+    assert "…" not in output.getvalue()
+    assert max(map(len, output.getvalue().splitlines())) <= 80
+    assert output.getvalue().count("±") == len(methods) * len(MAIN_COLUMNS)
+    assert all(column.heading in output.getvalue() for column in MAIN_COLUMNS)
+
+
 def test_a_table_says_why_lpips_is_missing_and_only_then():
-    assert "AlexNet" in str(rich_table(ROWS, MAIN_COLUMNS, 80).caption)
-    assert rich_table({"shellgs": {"lpips": 0.2}, "photo-gs": {}}, MAIN_COLUMNS, 80).caption is None
-    assert rich_table(ROWS, COLUMNS, 80).caption is None
+    def caption(rows: Rows, columns: Sequence[Column]) -> str:
+        return str(rich_table(rows, columns, 80).renderables[-1].caption)  # pyright: ignore
+
+    assert "AlexNet" in caption(ROWS, MAIN_COLUMNS)
+    assert caption({"shellgs": {"lpips": 0.2}, "photo-gs": {}}, MAIN_COLUMNS) == "None"
+    assert caption(ROWS, COLUMNS) == "None"
 
 
 def test_strip_is_written_in_one_file_and_grey_outside_the_mask(tmp_path):
