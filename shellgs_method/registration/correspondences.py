@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.spatial.distance import pdist
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.paths import captured_name, folded
@@ -103,7 +102,7 @@ def fit_robustly(
     survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
     shell = transformed(shell, survey_from_shell)
     _check_spread(scene[candidates], shell[candidates], called, remedy)
-    metres_per_scene_unit = np.median(pdist(shell[candidates]) / np.maximum(pdist(scene[candidates]), 1e-30))
+    metres_per_scene_unit = _extent(shell[candidates]) / max(_extent(scene[candidates]), 1e-30)
     limits = np.broadcast_to(np.maximum(MAX_ERROR, _MAX_PIXELS * metres_per_scene_unit * pixels), len(shell))
     used = _consensus(scene, shell, candidates, limits)
     if used.sum() < _MOST * candidates.sum():
@@ -211,6 +210,11 @@ def _left_out(k: int, scene: np.ndarray, shell: np.ndarray, used: np.ndarray) ->
         return float("nan")
     similarity = fit_similarity(scene[others], shell[others])
     return float(np.linalg.norm(transformed(scene[k : k + 1], similarity) - shell[k]))
+
+
+def _extent(points: np.ndarray) -> float:
+    """Size of points, whatever outliers there are among them."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _thinness(points: np.ndarray) -> float:
