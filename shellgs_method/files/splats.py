@@ -194,7 +194,10 @@ def _unit_quats(splats: Splats) -> Tensor:
 
 
 def _ply(splats: Splats, comments: Sequence[str]) -> bytes:
-    """The ply of 3D Gaussian Splatting: float32, unit quaternions, harmonics by channel."""
+    """The ply of 3D Gaussian Splatting: float32, unit quaternions, harmonics by channel.
+
+    Its header is ASCII: viewers count letters of it, not bytes, to find the data.
+    """
     rest = splats.harmonics[:, 1:].transpose(1, 2).flatten(1)
     columns = {
         ("x", "y", "z"): splats.means,
@@ -207,10 +210,10 @@ def _ply(splats: Splats, comments: Sequence[str]) -> bytes:
     }
     table = torch.cat([part.double() for part in columns.values()], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment {each}" for each in ((DISCS,) if splats.discs else ()) + tuple(comments)]
+    header += [f"comment {' '.join(each.split())}" for each in ((DISCS,) if splats.discs else ()) + tuple(comments)]
     header += [f"element vertex {len(table)}"]
     header += [f"property float {name}" for names in columns for name in names]
-    return "\n".join([*header, "end_header", ""]).encode() + table.tobytes()
+    return "\n".join([*header, "end_header", ""]).encode("ascii", "backslashreplace") + table.tobytes()
 
 
 def _glb(splats: Splats, comments: Sequence[str]) -> bytes:

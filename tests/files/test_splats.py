@@ -42,6 +42,18 @@ def test_gltf_has_linear_scales_and_opacities_and_each_coefficient_by_itself(tmp
     np.testing.assert_allclose(attributes["COLOR_0"][:, 3] / 255, own["OPACITY"][:, 0], atol=0.003)
 
 
+def test_the_header_of_a_ply_is_ascii_of_a_line_for_each_comment(tmp_path):
+    """A coordinate reference system may have any name; viewers count letters, not bytes, to find the data."""
+    splats = some()
+    write_splats(tmp_path / "a.ply", splats, ['crs: LOCALCRS["Zürich\nSüd"]'])
+    header, end, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    assert rb'comment crs: LOCALCRS["Z\xfcrich S\xfcd"]' in header.splitlines()
+    text = (tmp_path / "a.ply").read_bytes().decode("utf-8", "replace")
+    assert text.index("end_header\n") == len(header)
+    assert end
+    assert len(body) == 62 * 4 * len(splats)
+
+
 def test_spz_renders_as_what_was_written(tmp_path):
     splats = some()
     write_splats(tmp_path / "a.spz", splats)
