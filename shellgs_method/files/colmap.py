@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from shellgs_method.errors import SceneError, decimal_comma, notice
 from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order, remedy_for
 from shellgs_method.files.paths import NamedFiles
+from shellgs_method.files.readers.contents import with_nan
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
 """Folders of numbered models, or of one; it may also be in the scene itself, as RealityScan exports it."""
@@ -310,7 +311,7 @@ def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable
                 raise ValueError(f"it goes on for {len(file.data) - file.at} bytes after its last entry")
             return read
         lines = map(str.strip, path.read_text("utf-8-sig", errors="surrogateescape").splitlines())
-        return text(line for line in lines if line and not line.startswith("#"))
+        return text(with_nan(line) for line in lines if line and not line.startswith("#"))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     except (ValueError, IndexError, OverflowError, struct.error, StopIteration) as error:

@@ -233,5 +233,8 @@ def number(lens: Mapping[str, Any], key: str, where: str) -> float:
     except (TypeError, ValueError, OverflowError):
         value = float("nan")
     if not math.isfinite(value):
-        raise SceneError(f"{where} has {str(lens[key])[:40]!r} as its {key}, which is not a finite number")
+        raise SceneError(
+            f"{where} has {str(lens[key])[:40]!r} as its {key}, which is not a finite number: leave the photograph "
+            "out, or calibrate it again"
+        )
     return value

@@ -227,6 +227,14 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a missing parameter": (edit("cameras.txt", "PINHOLE", "OPENCV"), "OPENCV has 8 parameters, not 4"),
     "half an image": (edit("images.txt", " 1 frame_00001.png", ""), "images.txt is damaged"),
     "a pose of nan": (first_pose("nan nan nan nan 0 0 0"), "has no rotation"),
+    "a place of Windows' nan": (
+        first_pose("1 0 0 0 -nan(ind) 0 1.#QNAN"),
+        "frame_00001.png has NaN or infinite values",
+    ),
+    "a lens of Windows' nan": (
+        lambda folder: (folder / "cameras.txt").write_text("1 PINHOLE 48 32 -nan(ind) 40 24 16\n"),
+        "frame_00001.png has 'nan' as its fl_x, which is not a finite number: leave the photograph out",
+    ),
     "no rotation": (first_pose("0 0 0 0 0 0 0"), "has no rotation"),
     "an infinite place": (first_pose("1 0 0 0 inf 0 0"), "has NaN or infinite values in its pose"),
     "one photograph twice": (edit("images.txt", "frame_00002", "frame_00001"), "two cameras for the photograph"),
