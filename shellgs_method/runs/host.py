@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from types import SimpleNamespace
 from typing import Any, NoReturn, TextIO
@@ -178,10 +178,19 @@ def _mend_exporter(exporter: Any) -> None:
 
 
 def _mend_viewer(run_viewer: Any) -> None:
-    """Ns-viewer has an address of its own."""
-    run_viewer._start_viewer = _before(
-        run_viewer._start_viewer, lambda config, _pipeline, _step: check_viewer(config.viewer)
-    )
+    """Ns-viewer has an address of its own, and Ctrl-C, which is its only end, is no bug."""
+    start = run_viewer._start_viewer
+    if hasattr(start, "__wrapped__"):
+        return
+
+    @wraps(start)
+    def checked(config: Any, *rest: Any) -> None:
+        with refusals_end_the_program():
+            check_viewer(config.viewer)
+        with suppress(KeyboardInterrupt):
+            start(config, *rest)
+
+    run_viewer._start_viewer = checked
 
 
 def _running(kind: type) -> Any:

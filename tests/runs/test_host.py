@@ -189,6 +189,15 @@ def test_a_port_that_there_is_not_ends_ns_viewer(trainer):
         run_viewer._start_viewer(config, trainer.pipeline, 0)  # pyright: ignore
 
 
+def test_ctrl_c_ends_ns_viewer_without_a_traceback(monkeypatch):
+    def serve_until_ctrl_c(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_viewer, "_start_viewer", serve_until_ctrl_c)
+    mend_commands()
+    run_viewer._start_viewer(SimpleNamespace(viewer=ViewerConfig()), None, 0)  # pyright: ignore
+
+
 def test_what_is_refused_to_commands_does_not_stop_the_viewer(trainer):
     """It reads every attribute of a pipeline in search of its elements."""
     assert parse_object(trainer.pipeline, ViewerElement, "Custom") is not None
