@@ -150,7 +150,7 @@ class _Start:
             raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
         if self.metres_per_shell_unit != 1 and not self.shell:
             raise SceneError(
-                "--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again"
+                "--metres-per-shell-unit belongs to a shell: give the shell again, and its start if it had one"
             )
 
     def place(self, scene: Path, views: Sequence[View], points: SparsePoints) -> tuple[Placement, ShellMesh]:
