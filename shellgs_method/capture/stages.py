@@ -430,12 +430,13 @@ class _Capture:
             )
         lenses = largest.pop("lenses", [])
         if zoomed := largest.pop("zoomed", None):
-            change, short, long = zoomed
+            change, short, long, behind = zoomed
+            step = f" (in a step: {behind} is the first behind it)" if behind else ""
             notice(
                 f"The focal length of {self.source} seems to change by {change:.0%}, between {short} and {long} for "
-                "example, where one camera is taken for all: by zooming, another lens, or cropping, as stabilisation "
-                "does. Cameras may be metres off. Record without these; photographs of two lenses go into a folder "
-                "each, with --cameras folder."
+                f"example{step}, where one camera is taken for all: by zooming, another lens, or cropping, as "
+                "stabilisation does. Cameras may be metres off. Record without these; photographs of two lenses go "
+                "into a folder each, with --cameras folder."
             )
         else:
             for lens in lenses:

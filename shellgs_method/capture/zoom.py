@@ -10,18 +10,22 @@ from collections import Counter
 import numpy as np
 import pycolmap
 
+from loops import along_the_walk  # pyright: ignore[reportMissingImports]  isort: skip
+
 _POINTS = 80  # of a photograph, by which its own focal length is found
 # F, deviation of focal lengths, and ratio of costs at which photographs have not one camera. Right models have an F of
 # 7 and less, but one of 30 at a deviation of 0.02, and one taken straight down 63 and 0.08 at a ratio of 1.16; videos
 # with frames cropped by a tenth, a zoom or two lenses 39, 0.07 and 1.27, and more.
 _ZOOMED = 20.0, 0.03, 1.2
+_STEP = 0.15  # share of the variance that is left by one step; of a steady zoom a quarter is
 
 
 def zoomed(model: pycolmap.Reconstruction, images: list[pycolmap.Image], least: int) -> list | None:
     """How much the focal length changes between photographs of a camera, as a share of it, and the names of two.
 
-    None if one for each camera explains the photographs as well as one for each photograph (F-test of two bundle
-    adjustments, of some points).
+    Last is the first photograph behind a step, as of another lens, or None. None in place of all if one focal length
+    for each camera explains the photographs as well as one for each photograph (F-test of two bundle adjustments, of
+    some points).
 
     Args:
         model: the model.
@@ -44,7 +48,17 @@ def zoomed(model: pycolmap.Reconstruction, images: list[pycolmap.Image], least: 
         return None
     ranked = sorted(known, key=off.__getitem__)
     short, long = ranked[len(ranked) // 20], ranked[-1 - len(ranked) // 20]
-    return [float(np.expm1(off[long] - off[short])), model.image(short).name, model.image(long).name]
+    behind = _behind_a_step({model.image(number).name: off[number] for number in known})
+    return [float(np.expm1(off[long] - off[short])), model.image(short).name, model.image(long).name, behind]
+
+
+def _behind_a_step(focal: dict[str, float]) -> str | None:
+    """The first photograph of a walk behind the step that its focal lengths make, as of another lens; None without."""
+    names = sorted(focal, key=along_the_walk)
+    values = np.array([focal[name] for name in names])
+    left = [values[:k].var() * k + values[k:].var() * (len(values) - k) for k in range(1, len(values))]
+    k = int(np.argmin(left))
+    return names[k + 1] if left[k] < _STEP * values.var() * len(values) else None
 
 
 def _some_points(model: pycolmap.Reconstruction) -> list[int]:

@@ -1214,6 +1214,7 @@ sys.path.insert(0, sys.argv[1])
 import sfm  # first: it imports what must come before pycolmap
 import numpy as np
 import pycolmap
+import zoom
 
 pycolmap.set_random_seed(0)
 options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=200)
@@ -1227,7 +1228,8 @@ for image in images[8:]:
         ray = camera.cam_from_img(point.xy)
         point.xy = pycolmap.Camera(camera.todict() | {"params": camera.params * [1.3, 1, 1, 1]}).img_from_cam([*ray, 1])
 found.append(sfm.zoomed(model, sfm._registered(model), 10))
-print(json.dumps([found, [image.name for image in images]]))
+steady = zoom._behind_a_step({f"{k}.jpg": 0.1 * k for k in range(12)})
+print(json.dumps([[*found, steady], [image.name for image in images]]))
 """
 
 
@@ -1235,11 +1237,13 @@ def test_a_zoom_among_photographs_of_one_camera_is_noticed():
     """A third of them are enlarged by 1.3."""
     command = [sys.executable, "-c", _ZOOM, Path(stages.__file__).parent]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    (plain, (change, short, long)), names = json.loads(printed.splitlines()[-1])
+    (plain, (change, short, long, behind), steady), names = json.loads(printed.splitlines()[-1])
     assert plain is None
+    assert steady is None  # zooming goes on in all of them
     assert change == pytest.approx(0.3, abs=0.03)
     assert short in names[:8]
     assert long in names[8:]
+    assert behind == names[8]
 
 
 def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
@@ -1247,9 +1251,10 @@ def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
     for k in range(8):
         photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
     model = {"names": [f"{k}.jpg" for k in range(8)], "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
-    monkeypatch.setattr(stages, "run_step", answering({"reconstruct": [model | {"zoomed": [0.3, "4.jpg", "5.jpg"]}]}))
+    zoomed = {"zoomed": [0.3, "4.jpg", "5.jpg", "3.jpg"]}
+    monkeypatch.setattr(stages, "run_step", answering({"reconstruct": [model | zoomed]}))
     capture(tmp_path / "photographs", tmp_path / "scene")
-    assert "seems to change by 30%, between 4.jpg and 5.jpg" in caplog.text
+    assert "seems to change by 30%, between 4.jpg and 5.jpg for example (in a step: 3.jpg is the first" in caplog.text
 
 
 @pytest.mark.parametrize(
