@@ -434,9 +434,9 @@ class _Capture:
             step = f" (in a step: {behind} is the first behind it)" if behind else ""
             notice(
                 f"The focal length of {self.source} seems to change by {change:.0%}, between {short} and {long} for "
-                f"example{step}, where one camera is taken for all: by zooming, another lens, or cropping, as "
-                "stabilisation does. Cameras may be metres off. Record without these; photographs of two lenses go "
-                "into a folder each, with --cameras folder."
+                f"example{step}, where one camera is taken for all: by zooming, another lens, cropping, as "
+                "stabilisation does, or the distortion of a fisheye lens. Cameras may be metres off. Record without "
+                "these; photographs of two lenses go into a folder each, with --cameras folder."
             )
         else:
             for lens in lenses:
