@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -90,10 +90,11 @@ def test_normals_are_oriented_without_viewpoints():
     assert cue.mask[window].mean() < 0.05
 
 
-def test_points_in_one_plane_make_a_wall():
+@pytest.mark.parametrize(("turn", "viewpoints"), [([20, 50, 9], STREET), ([0, 0, 0], NO_POINTS)])
+def test_points_in_one_plane_make_a_wall(turn: Sequence[float], viewpoints: np.ndarray):
     x, y = np.meshgrid(np.arange(20.0), np.arange(10.0))
-    grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) @ Rotation.from_euler("xyz", [20, 50, 9], True).as_matrix()
-    mesh = meshed(grid)
+    grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) @ Rotation.from_euler("xyz", turn, True).as_matrix()
+    mesh = meshed(grid, viewpoints=viewpoints)
     triangles = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
     assert area.sum() == pytest.approx(19 * 9)
