@@ -32,7 +32,6 @@ from shellgs_method.occlusion.contradiction import (
     ShellView,
     Sweep,
     agreement,
-    sides,
     sweep,
     sweep_behind,
 )
@@ -45,6 +44,7 @@ from shellgs_method.occlusion.exposure import (
     sightings_on_surface,
 )
 from shellgs_method.occlusion.low_light import LowLight
+from shellgs_method.occlusion.neighbours import sides
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""

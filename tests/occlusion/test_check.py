@@ -41,22 +41,18 @@ from shellgs_method.occlusion.contradiction import (
     ALONE,
     CONFIRMED,
     CONTRADICTED,
-    MOVES,
-    MOVES_ON,
     REFLECTED,
     Agreement,
     ShellView,
     Sweep,
     _better_half,
     agreement,
-    neighbours,
-    offsets_before,
-    sides,
     sweep,
     sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.occlusion.low_light import BLUR, DARK, LowLight, noise
+from shellgs_method.occlusion.neighbours import MOVES, MOVES_ON, neighbours, offsets_before, sides
 from shellgs_method.occlusion.verdicts import Verdicts
 from shellgs_method.viewer import ContradictedShell
 

@@ -1,0 +1,84 @@
+"""Which photographs a view is compared with, and at which depths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from shellgs_method.geometry.camera import Camera
+
+_NEAREST, _FARTHEST, _STEP = 0.0125, 1.38, 1.4
+_FINEST = 0.02  # difference of offsets below which none is tried, however far apart the cameras are
+OFFSETS_BEHIND = tuple(-2 * _NEAREST * 2.0**k for k in range(6))
+"""Tried depths behind the shell, as the relative excess of their inverse over the shell's: from 20 cm behind a wall
+that is 8 m away to five times its depth. They are few, since what is found there need not be accurate."""
+MOVES = 5.5
+"""Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and with much more
+fewer photographs show the same."""
+MOVES_ON = 4.0
+"""Most pixels by which a place moves in the nearest photograph from one tried depth to the next. Where photographs are
+far apart, thin things were between two."""
+PER_SIDE = 4
+"""Neighbours on either side of a view: what is occluded on one side is visible from the other."""
+PER_SIDE_BEHIND = 2
+"""The same for what is behind the shell."""
+
+Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
+"""Distances and indices of cameras on the left and on the right of a view."""
+
+
+def offsets_before(view: Camera, others: Sides, depth: float) -> list[float]:
+    """Depths to try in front of the shell, as the relative excess of their inverse over the shell's.
+
+    They reach from 10 cm in front of a wall that is 8 m away to two fifths of its depth. Each is 1.4 times the one
+    before; less where the nearest camera would see a place move by more than :data:`MOVES_ON`.
+
+    Args:
+        view: the view's camera.
+        others: the other cameras, by :func:`sides`.
+        depth: typical depth of the shell in the view.
+    """
+    nearest = min((baseline for side in others for baseline, _ in side), default=depth)
+    most = max(MOVES_ON * depth / (nearest * float(view.K[0, 0])), _FINEST)
+    offsets = [_NEAREST]
+    while offsets[-1] < _FARTHEST:
+        offsets.append(min(_STEP * offsets[-1], offsets[-1] + most))
+    return offsets
+
+
+def neighbours(
+    view: Camera, others: Sides, depth: float, offset: float, per_side: int = PER_SIDE
+) -> list[tuple[int, int]]:
+    """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES` pixels.
+
+    Args:
+        view: the view's camera.
+        others: cameras to choose from, by :func:`sides`.
+        depth: typical depth of the shell in the view.
+        offset: one of :func:`offsets_before` or :data:`OFFSETS_BEHIND`.
+        per_side: number of cameras on either side.
+
+    Returns:
+        Index and side of each camera: 0 on the left, 1 on the right.
+    """
+    wanted = MOVES * depth / (abs(offset) * float(view.K[0, 0]))
+    found = [sorted((max(baseline / wanted, wanted / baseline), index) for baseline, index in side) for side in others]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:per_side]]
+
+
+def sides(view: Camera, others: Sequence[Camera], depth: float) -> Sides:
+    """Distances and indices of the cameras left and right of a view that look in about the same direction.
+
+    Those at the view's own position, relative to the typical depth of the shell, show no parallax and are left out.
+    """
+    found: Sides = ([], [])
+    if others:
+        viewmats = torch.stack([other.viewmat for other in others])
+        steps = -(viewmats[:, :3, 3:].mT @ viewmats[:, :3, :3])[:, 0] - view.position
+        away = steps.norm(dim=-1)
+        alike = (viewmats[:, 2, :3] @ view.viewmat[2, :3] > 0.5) & (away > 1e-6 * depth)
+        is_right, baselines = (steps @ view.viewmat[0, :3] > 0).tolist(), away.tolist()
+        for index in alike.nonzero()[:, 0].tolist():
+            found[is_right[index]].append((baselines[index], index))
+    return found
