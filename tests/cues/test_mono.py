@@ -23,7 +23,7 @@ from shellgs_method.cli import main
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as_disparity, fit_disparity
 from shellgs_method.cues.maps import Fits, MonoSummary, make_maps
-from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, gradient_normals, to_opencv
+from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, to_opencv
 from shellgs_method.cues.source import Prediction, Predictor
 from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
@@ -159,12 +159,6 @@ def test_wrong_axes_are_detected_and_the_right_ones_named():
     assert problem is not None
     assert problem.startswith("read as opencv they are 52° from")
     assert problem.endswith("as opengl 0°")
-
-
-def test_gradient_normals_of_a_plane_are_its_normal():
-    normal = gradient_normals(plane_depth(), CAMERA)
-    np.testing.assert_allclose(normal[1:-1, 1:-1], np.broadcast_to(WALL, (46, 62, 3)), atol=1e-4)
-    assert not normal[0].any()
 
 
 # SfM points

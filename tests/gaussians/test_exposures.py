@@ -22,6 +22,9 @@ from shellgs_method.trainer import FacadeTrainer, PerViewAdamConfig
 
 STOPS = np.log(2)
 GAINS = 0.6 * STOPS * np.sin(np.arange(10))[:, None] * [1.0, 0.9, 1.1]
+TRAINED = [k for k in range(10) if k % 8]
+MEAN = GAINS[TRAINED].mean(axis=0)
+RELATIVE = GAINS - MEAN
 
 
 def learned(config) -> None:
@@ -48,11 +51,6 @@ def trained(changing: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeT
     return trainer
 
 
-def of_training(trainer: FacadeTrainer) -> np.ndarray:
-    gains = GAINS[[k for k in range(10) if k % 8]]
-    return gains - gains.mean(axis=0)
-
-
 def log_gains(trainer: FacadeTrainer) -> np.ndarray:
     exposures = model_of(trainer).exposures
     assert exposures is not None
@@ -62,7 +60,7 @@ def log_gains(trainer: FacadeTrainer) -> np.ndarray:
 @pytest.mark.parametrize("method", ["shellgs_metric", "photo_gs"])
 def test_a_run_starts_from_the_exposures_of_its_photographs(changing, tmp_path, method):
     trainer = trainer_of(changing, tmp_path, method, change=learned)
-    np.testing.assert_allclose(log_gains(trainer), of_training(trainer), atol=0.15 * STOPS)
+    np.testing.assert_allclose(log_gains(trainer), RELATIVE[TRAINED], atol=0.15 * STOPS)
 
 
 def test_seeds_have_the_mean_exposure(changing, pristine_scene, tmp_path):
@@ -72,7 +70,7 @@ def test_seeds_have_the_mean_exposure(changing, pristine_scene, tmp_path):
         trainer = trainer_of(scene, tmp_path / name, "shellgs_metric")
         colours[name] = model_of(trainer).colors.detach()
     count = min(map(len, colours.values()))
-    mean = torch.from_numpy(GAINS[[k for k in range(10) if k % 8]].mean(axis=0)).float()
+    mean = torch.from_numpy(MEAN).float()
     expected = exposed(colours["constant"][:count], mean)
     assert (colours["changing"][:count] - expected).abs().median() < 0.03
 
@@ -80,7 +78,7 @@ def test_seeds_have_the_mean_exposure(changing, pristine_scene, tmp_path):
 def test_gains_stay_near_the_true_ones_and_have_a_mean_of_zero(trained):
     found = log_gains(trained)
     np.testing.assert_allclose(found.mean(axis=0), 0, atol=1e-7)
-    np.testing.assert_allclose(found, of_training(trained), atol=0.2 * STOPS)
+    np.testing.assert_allclose(found, RELATIVE[TRAINED], atol=0.2 * STOPS)
 
 
 def test_their_mean_is_zero_whatever_the_optimizer_does():
@@ -136,7 +134,7 @@ def test_held_out_views_and_splats_do_not_depend_on_the_exposures(trained):
 
 def test_renders_are_as_bright_as_the_photographs_at_their_mean_exposure(trained):
     model, dataset, apart = model_of(trained), data_of(trained).train_dataset, []
-    for index, gain in enumerate(of_training(trained)):
+    for index, gain in enumerate(RELATIVE[TRAINED]):
         photograph = torch.from_numpy(dataset.get_numpy_image(index)) / 255
         render = model.get_outputs_for_camera(dataset.cameras[index : index + 1])["rgb"]
         apart.append((render - exposed(photograph, -torch.from_numpy(gain).float()).clamp(0, 1)).median())
@@ -147,8 +145,7 @@ def test_photographs_of_a_texture_are_brought_to_the_mean_exposure(trained):
     """Those of training views by their learned exposures, held-out ones by their renders."""
     found = TrainedRun(model_of(trained), data_of(trained)).log_gains()
     np.testing.assert_allclose(found[:8], log_gains(trained), atol=1e-6)
-    mean = GAINS[[k for k in range(10) if k % 8]].mean(axis=0)
-    np.testing.assert_allclose(found[8:], GAINS[[0, 8]] - mean, atol=0.5 * STOPS)
+    np.testing.assert_allclose(found[8:], RELATIVE[[0, 8]], atol=0.5 * STOPS)
 
 
 def test_what_is_masked_out_does_not_change_the_exposure_of_a_held_out_photograph(trained, tmp_path, monkeypatch):

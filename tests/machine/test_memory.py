@@ -52,13 +52,9 @@ def test_a_container_has_what_its_limit_leaves(tmp_path):
     assert in_group(tmp_path, "0::/") == 4000  # files that the system can drop are free
 
 
-def test_a_group_without_a_limit_has_what_the_machine_has(tmp_path):
-    v2(tmp_path, "", "max", used=5000)
-    assert in_group(tmp_path, "0::/") == FREE
-
-
-def test_a_limit_above_the_free_memory_is_none(tmp_path):
-    v2(tmp_path, "", 10 * FREE, used=5000)
+@pytest.mark.parametrize("limit", ["max", 10 * FREE])
+def test_a_limit_above_the_free_memory_is_none(tmp_path, limit):
+    v2(tmp_path, "", limit, used=5000)
     assert in_group(tmp_path, "0::/") == FREE
 
 

@@ -124,7 +124,7 @@ def shifted(right: float = 0.0, up: float = 0.0, out: float = 0.0) -> Alignment:
     return Alignment(TRUTH @ move, ("shell/facade.ply",))
 
 
-def in_its_own_frame(mesh: ShellMesh, points: SparsePoints) -> tuple[Placement, np.ndarray]:
+def in_its_own_frame(points: SparsePoints) -> tuple[Placement, np.ndarray]:
     """A scene in the shell's national coordinates: the exact placement, and the SfM points."""
     return Placement(Alignment(np.eye(4), ("facade.ply",))), transformed(points.positions, np.linalg.inv(TRUTH))
 
@@ -133,7 +133,7 @@ def in_its_own_frame(mesh: ShellMesh, points: SparsePoints) -> tuple[Placement, 
 
 
 def test_refinement_does_not_follow_points_in_single_precision(mesh, views, points):
-    placement, exact = in_its_own_frame(mesh, points)
+    placement, exact = in_its_own_frame(points)
     rounded = SparsePoints(exact.astype(np.float32).astype(np.float64))
     with pytest.raises(
         SceneError, match=r"--refine .* the SfM points are stored in steps of 0\.031 x 0\.5 x 1\.5e-05 m"
@@ -156,7 +156,7 @@ def test_decimetres_of_a_shell_are_never_good(mesh, views, points):
 
 
 def test_an_alignment_is_refused_if_its_cameras_were_rounded_to_metres(mesh, views, points):
-    placement, exact = in_its_own_frame(mesh, points)
+    placement, exact = in_its_own_frame(points)
     moved = []
     for view in views:
         viewmat = view.camera.viewmat @ torch.from_numpy(TRUTH)

@@ -17,7 +17,6 @@ from scenes import cast
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
-from shellgs_method.evaluation import normal_colours
 from shellgs_method.evaluation.panels import supervision_panel
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
@@ -573,13 +572,6 @@ def test_no_views_are_refused(tmp_path: Path, alignment: Alignment):
 
 
 # Images and masks
-
-
-def test_a_wall_seen_from_the_front_is_bluish():
-    cue = ShellCaster(box(), np.eye(4)).cast(camera_at([0, 0, 0]))
-    colours = normal_colours(cue.normal, cue.mask)
-    assert (colours[cue.mask] == [128, 128, 255]).all()
-    assert (colours[~cue.mask] == 153).all()
 
 
 @pytest.mark.parametrize(("metres_per_unit", "label"), [(2.0, "metres"), (None, "scene units")])
