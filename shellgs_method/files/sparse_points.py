@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, Int, UInt8
+from jaxtyping import Bool, Float64, Int, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import colmap, transforms
@@ -16,6 +16,10 @@ from shellgs_method.files.scene import SceneLayout
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import Step, cloud_step, warn_of_coarse
+
+STACKED = 4
+"""Points in one place whose Gaussians would begin without a width, as that is the distance of the three nearest; two,
+which COLMAP makes of a feature with two orientations, do no harm."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,27 @@ def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
-    """Indices of the points that are finite and near the others."""
+    """Indices of the points that are finite and near the others, and one of those in each place where many are."""
     near = inliers(positions)
     if not near.all():
         notice(
             f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "
             "and are left out."
         )
-    return np.flatnonzero(near)
+    again = _again(positions)
+    if again.any():
+        notice(
+            f"{again.sum()} of {len(positions)} SfM points of {layout.data} are where others are, as the corners of a "
+            "mesh's triangles, and are left out."
+        )
+    return np.flatnonzero(near & ~again)
+
+
+def _again(positions: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Which points are where at least three others are, but for the first of these."""
+    order = np.lexsort(positions.T)  # which keeps the order of equals
+    first = np.append(True, (positions[order[1:]] != positions[order[:-1]]).any(axis=1))[: len(order)]
+    place = np.cumsum(first) - 1
+    again = np.zeros(len(positions), bool)
+    again[order] = ~first & (np.bincount(place)[place] >= STACKED if len(place) else first)
+    return again

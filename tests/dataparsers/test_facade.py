@@ -145,6 +145,26 @@ def test_points_without_colours_are_grey(scene):
 
 
 @pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
+def test_points_where_others_are_are_left_out(scene, caplog, kind):
+    """As a mesh has them whose triangles have corners of their own: without any width, they cost 18 dB."""
+    header = ["ply", "format ascii 1.0", "element vertex 8", *(f"property float {axis}" for axis in "xyz")]
+    places = ["0 0 5", "1 0 5", "0 1 5", "0 1 5", "1 0 6"]  # of two in one place, both are kept
+    (scene / "sparse_pc.ply").write_text("\n".join([*header, "end_header", *places, *places[1:2] * 3, ""]))
+    expected = read_sparse_points(FacadeDataParserConfig(data=scene)).positions
+    np.testing.assert_allclose(expected, [[float(x) for x in place.split()] for place in places])
+    if kind == "COLMAP":
+        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        points = [f"{k} {place} 9 9 9 0 1 0\n" for k, place in enumerate([*places, *places[1:2] * 3], start=1)]
+        (scene / "sparse/0/points3D.txt").write_text("".join(points))
+        found = read_sparse_points(FacadeDataParserConfig(data=scene))
+        np.testing.assert_array_equal(found.positions, expected)
+        assert found.observed is not None
+        assert len(found.observed["images/frame_00001.png"]) == 5
+    assert "3 of 8 SfM points" in caplog.text
+    assert "are where others are" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
 def test_black_points_are_grey_and_told(scene, caplog, kind):
     """As where colours were not extracted: a black Gaussian would get no gradient."""
     if kind == "COLMAP":
