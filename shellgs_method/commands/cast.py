@@ -231,7 +231,7 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     if verdicts.moved_in:
         console.print(
             f"Views in which something hides the shell that no other photograph shows, such as a passer-by or a car: "
-            f"{len(verdicts.moved_in)}, mostly {verdicts.moved_in[0]}; shellgs-metric ignores it."
+            f"{len(verdicts.moved_in)}, mostly {verdicts.moved_in[0]}; shellgs-metric leaves it out."
         )
     if verdicts.unclear > UNCLEAR:
         console.print(

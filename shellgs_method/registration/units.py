@@ -55,7 +55,7 @@ def doubted(lengths: Mapping[str, float], metres_per_unit: float) -> str | None:
     then = {words: length * best / metres_per_unit for words, length in lengths.items()}
     return (
         f"Is the shell's unit the {_UNITS[best]}, not the {_UNITS[metres_per_unit]}? Now {_in_words(lengths)}; with "
-        f"--metres-per-shell-unit {best:g} {_in_words(then)}. It was left as it is."
+        f"--metres-per-shell-unit {best:g} {_in_words(then)}. The unit was not changed."
     )
 
 

@@ -110,8 +110,8 @@ class Ground:
         area = self.known.sum() * self.cell**2
         return (
             f"The ground is a height field, measured on {area:.0f} m² "
-            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point); elsewhere it goes on as "
-            "beside that."
+            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point) and "
+            "extrapolated elsewhere."
         )
 
     @property
