@@ -130,7 +130,7 @@ def follow(
                         file.write(line.encode())
                 if waiting and line == heading(waiting[0]):
                     announce(current := waiting.pop(0))
-                    tell(_first_stage(current))
+                    tell(Stage(f"Starting {' '.join(current[:2])}"))  # until it prints something
                 elif stage := Stage.read(line):
                     if stage.what == ITERATION and stage.item:
                         if stage.item <= iteration:  # nerfstudio repeats the last lines of its table
@@ -144,11 +144,6 @@ def follow(
             _RUNNING.remove(process)
     if process.returncode:
         raise CommandError(f"{current[0]} failed:\n{''.join(output)}")
-
-
-def _first_stage(command: Sequence[str]) -> Stage:
-    """What a command does before it prints anything."""
-    return Stage("Importing nerfstudio" if command[0] == "ns-train" else f"Starting {' '.join(command[:2])}")
 
 
 def _devices(jobs: int) -> SimpleQueue[str | None]:
