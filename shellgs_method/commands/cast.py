@@ -28,6 +28,8 @@ SELDOM = 0.01
 """Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
 HOLES = 0.01
 """Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
+GLASS = 0.01
+"""Share of the shell behind which photographs agree on something, above which it is hardly all panes of glass."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
@@ -223,10 +225,18 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     verdicts = shell_verdicts(scene, views)
     places = scene / CONTRADICTED_PLACES
     verdicts.write(places)
-    if verdicts.share > 0:
+    if verdicts.before.share > 0:
         console.print(
-            f"{verdicts.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those that "
-            f"see it: look at {verdicts.witness}, and at {places}, red where the building differs."
+            f"{verdicts.before.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those "
+            f"that see it: look at {verdicts.views[verdicts.before.witness]}, and at {places}, red where the building "
+            "differs."
+        )
+    if verdicts.behind.share > GLASS:
+        console.print(
+            f"Behind {verdicts.behind.share:.1%} of the shell, as many photographs show something else: look at "
+            f"{verdicts.views[verdicts.behind.witness]}, and at {places}, magenta there. If that is no glass, the "
+            "building lacks this part of the shell, or stands back: take it out, as it draws the surface there.",
+            style="yellow",
         )
     if verdicts.moved_in:
         console.print(

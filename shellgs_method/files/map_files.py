@@ -122,11 +122,11 @@ class Findings(NamedTuple):
     moved: Bool[np.ndarray, "H W"]
     """Only this view's photograph shows something in front of it."""
     beyond: Bool[np.ndarray, "H W"]
-    """The background: at its borders, the shell is larger than the building."""
+    """The background, or a part of the building behind a wall of the model: the shell is larger than the building."""
     confirmed: Bool[np.ndarray, "H W"]
     """The shell."""
     behind: Bool[np.ndarray, "H W"]
-    """Something behind the shell, which a window reflects or lets through."""
+    """Something behind the shell, which a window reflects or lets through; behind any part, if no windows are known."""
     doubtful: Bool[np.ndarray, "H W"]
     """Perhaps something in front of the shell: photographs agree there somewhat better than on it."""
 

@@ -52,7 +52,7 @@ NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
-VERSION = 15
+VERSION = 16
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -201,12 +201,11 @@ class _TrainingViews:
         score, alone = (_resized(scores, size).numpy() for scores in (coloured, agreed.alone))
         beyond = _resized(agreed.beyond.float(), size).numpy() > 0.5
         static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
-        hidden = static | moved | beyond
         confirmed = _resized(found.score.float(), size).numpy() < CONFIRMED
         score_behind, farther = self._behind(seen, size)
         behind = score_behind > REFLECTED
-        if cue.classes is not None and self.windows:
-            behind &= cue.classes == SurfaceClass.WINDOW
+        solid = cue.classes != SurfaceClass.WINDOW if cue.classes is not None and self.windows else False
+        hidden = static | moved | beyond | (behind & solid)
         nearer = _relative_depth(found, size)
         kinds = [static, beyond, moved, behind, confirmed, score > DOUBTFUL]
         depth = cue.depth * np.select(kinds, [nearer, 2.0, 1.0, farther, 1.0, nearer], 0.0)

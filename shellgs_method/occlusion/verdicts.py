@@ -16,13 +16,15 @@ from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.cue_maps import CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.voxels import cell_means, voxel_cells
 
 CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
 """File in the scene's folder for :meth:`Verdicts.write`, shown by viewers."""
 MANY = 6
-"""Photographs that must contradict a point, and be half of those that see it, for the building to differ from its shell
-there. An occluder farther in front of the shell hides different points in each photograph."""
+"""Photographs that must contradict a point, and be half of those that see it, for the building to differ from its
+shell there. An occluder farther in front of the shell hides different points in each photograph, and a pane
+mirrors others."""
 MOVED = 0.004
 """Share of a view's shell above which what moved is worth mentioning."""
 UNCLEAR = 0.25
@@ -34,40 +36,53 @@ _SAME = 0.01  # relative difference of depth within which a point is visible in 
 
 
 @dataclass(frozen=True)
+class Votes:
+    """Votes of the views against points of the shell.
+
+    Attributes:
+        count: number of views that contradict each point.
+        differs: mask of the points where the building differs from the shell, by :data:`MANY`.
+        share: their share of the points that any view sees.
+        witness: index of the view that contradicts most of them.
+    """
+
+    count: Int64[np.ndarray, " N"]
+    differs: Bool[np.ndarray, " N"]
+    share: float
+    witness: int
+
+    @classmethod
+    def of(cls, against: Bool[np.ndarray, "V N"], seen: Int64[np.ndarray, " N"]) -> Votes:
+        """Count the votes of all views against points, each of which some number of them sees."""
+        count = against.sum(axis=0)
+        differs = (count >= MANY) & (2 * count >= seen)
+        share = differs.sum() / max((seen > 0).sum(), 1)
+        return cls(count, differs, float(share), int(against[:, differs].sum(axis=1).argmax()) if len(against) else 0)
+
+
+@dataclass(frozen=True)
 class Verdicts:
     """Verdicts of the photographs on points of the shell, in the scene's frame and units.
 
     Attributes:
         places: the points.
         seen: number of views in which each is visible.
-        contradicted: number of these views that show something in front of it, other than what moved.
-        distance: median distance of that from the point; NaN where no view contradicts it.
+        before: votes of the views that show something in front of them, other than what moved.
+        behind: votes of the views that show something behind them, through no window of the shell's model.
+        distance: median distance of what stands in front of each; NaN where no view shows it.
         views: names of all views.
-        differs: mask of the points where the building differs from the shell, by :data:`MANY`.
-        by_view: number of these points that each view contradicts.
         moved: share of each view's shell that is hidden by something that moved, since no other view shows it.
         doubted: share of each view's shell that something may stand in front of.
     """
 
     places: Float64[np.ndarray, "N 3"]
     seen: Int64[np.ndarray, " N"]
-    contradicted: Int64[np.ndarray, " N"]
+    before: Votes
+    behind: Votes
     distance: Float64[np.ndarray, " N"]
     views: list[str]
-    differs: Bool[np.ndarray, " N"]
-    by_view: Int64[np.ndarray, " V"]
     moved: Float64[np.ndarray, " V"]
     doubted: Float64[np.ndarray, " V"]
-
-    @property
-    def share(self) -> float:
-        """Share of the visible points where the building differs."""
-        return float(self.differs.sum() / max((self.seen > 0).sum(), 1))
-
-    @property
-    def witness(self) -> str:
-        """Name of the view that contradicts most of these points."""
-        return self.views[int(self.by_view.argmax())]
 
     @property
     def moved_in(self) -> list[str]:
@@ -80,9 +95,9 @@ class Verdicts:
         return float(self.doubted.mean()) if len(self.doubted) else 0.0
 
     def write(self, path: Path) -> None:
-        """Write the points as a ply, redder where a larger share of the views contradicts them."""
-        red = self.contradicted / np.maximum(self.seen, 1)
-        colours = 255 - 255 * red[:, None] * [0.1, 1, 1]
+        """Write the points as a ply, redder where more of the views show something in front of them, else magenta."""
+        before, behind = (votes.count / np.maximum(self.seen, 1) for votes in (self.before, self.behind))
+        colours = 255 - 255 * (before[:, None] * [0.1, 1, 1] + behind[:, None] * [0.2, 1, 0.2])
         content: Any = trimesh.PointCloud(self.places, colours.round().astype(np.uint8)).export(file_type="ply")
         write_whole(path, content)
 
@@ -104,8 +119,9 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     if places is None:
         places = _seen_places(sized, shell)
     seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
+    behind = np.zeros(distances.shape, bool)
     moved, doubted = [], []
-    for distance, view in zip(distances, sized, strict=True):
+    for distance, farther, view in zip(distances, behind, sized, strict=True):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
         cue, check = shell.require(view.name, camera), checked.require(view.name, camera)
         inside, pixels, z = in_view(camera, places)
@@ -120,14 +136,14 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         occluded = visible & found.occluder[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
-    contradicted = np.isfinite(distances).sum(axis=0)
+        solid = True if cue.classes is None else cue.classes != SurfaceClass.WINDOW
+        farther[k] = visible & ((found.behind & solid) | found.beyond)[rows, columns]
     median = np.full(len(places), np.nan)
-    some = contradicted > 0
+    some = np.isfinite(distances).any(axis=0)
     median[some] = np.nanmedian(distances[:, some], axis=0)
-    differs = (contradicted >= MANY) & (2 * contradicted >= seen)
-    by_view = np.isfinite(distances[:, differs]).sum(axis=1)
+    before, beyond = Votes.of(np.isfinite(distances), seen), Votes.of(behind, seen)
     names = [view.name for view in sized]
-    return Verdicts(places, seen, contradicted, median, names, differs, by_view, np.array(moved), np.array(doubted))
+    return Verdicts(places, seen, before, beyond, median, names, np.array(moved), np.array(doubted))
 
 
 def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:

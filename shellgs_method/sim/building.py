@@ -179,7 +179,7 @@ class Reconstruction:
         if "checked" not in find_cues(self.folder):
             return np.full(len(points), np.nan)
         verdicts = shell_verdicts(self.folder, self.views, transformed(points, self.frame.to_scene))
-        return np.where(verdicts.differs, verdicts.distance / self.frame.scale, np.nan)
+        return np.where(verdicts.before.differs, verdicts.distance / self.frame.scale, np.nan)
 
     def classes_at(self, points: Float64[np.ndarray, "N 3"]) -> UInt8[np.ndarray, " N"]:
         """Class of the shell nearest to points in the simulation frame; OTHER where it is not near."""

@@ -22,6 +22,7 @@ from viser import SceneApi
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method import occlusion
+from shellgs_method.commands import cast as casting
 from shellgs_method.evaluation import Rendering, pixels
 from shellgs_method.evaluation.panels import check_panel
 from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
@@ -53,7 +54,7 @@ from shellgs_method.occlusion.contradiction import (
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.occlusion.low_light import BLUR, DARK, LowLight, noise
 from shellgs_method.occlusion.neighbours import MOVES, MOVES_ON, neighbours, offsets_before, sides
-from shellgs_method.occlusion.verdicts import Verdicts
+from shellgs_method.occlusion.verdicts import Verdicts, Votes
 from shellgs_method.viewer import ContradictedShell
 
 WIDTH, HEIGHT = 144, 64
@@ -552,9 +553,12 @@ def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Pat
         shell.write(views[-1].name, CueMap(wall, normal, wall > 0, classes), view.camera)
     check_views(tmp_path, views, [])
     name, camera = views[MIDDLE].name, views[MIDDLE].camera
-    found = Findings.of(CueMaps.open(tmp_path, "checked").require(name, camera), shell.require(name, camera)).behind
-    assert found[windows[MIDDLE]].mean() > 0.5
-    assert found[~windows[MIDDLE]].any() != known
+    found = Findings.of(CueMaps.open(tmp_path, "checked").require(name, camera), shell.require(name, camera))
+    assert found.behind[windows[MIDDLE]].mean() > 0.5
+    wall = ~windows[MIDDLE]
+    assert found.behind[wall].any() != known
+    assert found.beyond[wall].any() == known
+    assert not (found.beyond & windows[MIDDLE]).any()
 
 
 def test_a_checked_map_says_what_a_pixel_shows():
@@ -670,6 +674,12 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     assert model._view(batch).photometric.mask is None
 
 
+def test_what_photographs_show_behind_the_shell_is_told_where_it_is_more_than_glass(shellgs, scene: Path, monkeypatch):
+    assert "of the shell, as many photographs show" not in " ".join(shellgs("cast", scene).split())
+    monkeypatch.setattr(casting, "GLASS", -1.0)
+    assert "of the shell, as many photographs show" in " ".join(shellgs("cast", scene).split())
+
+
 def test_photographs_that_tell_little_are_told(shellgs, scene: Path, monkeypatch):
     assert "tell little of" not in shellgs("cast", scene)
     monkeypatch.setattr(occlusion, "UNCLEAR", 0.0)  # some pixels of any scene are doubted
@@ -691,20 +701,20 @@ def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
     places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
     verdicts = shell_verdicts(tmp_path, views, transformed(places, np.linalg.inv(WORLD)))
     assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no image
-    assert verdicts.contradicted.tolist() == [8, 0, 0, 0]
+    assert verdicts.before.count.tolist() == [8, 0, 0, 0]
     slant = np.hypot(1, 0.35 / WALL)  # of the median camera's ray
     assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
     assert np.isnan(verdicts.distance[1:]).all()
-    assert verdicts.share == 0.5
+    assert (verdicts.before.share, verdicts.behind.share) == (0.5, 0)
     assert verdicts.unclear == pytest.approx(0.1)
-    assert verdicts.contradicted[0] >= MANY
+    assert verdicts.before.count[0] >= MANY
 
     spread = shell_verdicts(tmp_path, views)
     on_wall = transformed(spread.places, WORLD)
     np.testing.assert_allclose(on_wall[:, 2], WALL, rtol=1e-6)
     contradicted = np.abs(on_wall[:, 0]) < 0.35
     assert contradicted.any()
-    assert (spread.contradicted[contradicted] > 0).all()
+    assert (spread.before.count[contradicted] > 0).all()
     spread.write(tmp_path / "places.ply")
     cloud = trimesh.load(tmp_path / "places.ply")
     assert isinstance(cloud, trimesh.PointCloud)
@@ -742,11 +752,45 @@ def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scen
     assert not settings["visible"]
 
 
-def test_verdicts_name_the_view_that_contradicts_most_and_those_in_which_much_moved():
-    nothing = np.zeros(0)
-    by_view, moved = np.array([3, 9, 4]), np.array([0.0039, 0.01, 0.2])
-    verdicts = Verdicts(np.zeros((0, 3)), nothing, nothing, nothing, ["a", "b", "c"], nothing, by_view, moved, nothing)
-    assert verdicts.witness == "b"
+@pytest.mark.parametrize("window", [False, True])
+def test_a_wall_behind_which_most_views_show_something_is_not_there_unless_it_is_a_window(tmp_path: Path, window: bool):
+    """A wall at z = 8; 7 of 10 cameras show something at z = 9 behind its middle, one of them as the background."""
+    views = [View(f"{k}.png", tmp_path / f"{k}.png", turned(camera_at(0.1 * k))) for k in range(10)]
+    shell, checked = (CueMaps.create(tmp_path, kind, command="cast") for kind in ("shell", "checked"))
+    normal, wall = np.zeros((HEIGHT, WIDTH, 3), np.float16), np.full((HEIGHT, WIDTH), WALL, np.float32)
+    for k, view in enumerate(views):
+        middle = np.abs((view.camera.rays().numpy() * WALL)[..., 0] + 0.1 * k) < 0.4
+        classes = np.where(middle & window, SurfaceClass.WINDOW, SurfaceClass.WALL).astype(np.uint8)
+        shell.write(view.name, CueMap(wall, normal, wall > 0, classes), view.camera)
+        found = np.where(middle & (k < 7), np.float32(9), np.float32(0))
+        checked.write(view.name, CueMap(found, normal, middle & (k == 3) & (not window)), view.camera)
+    places = transformed(np.array([[0.0, 0, WALL], [1.0, 0, WALL]]), np.linalg.inv(WORLD))
+    verdicts = shell_verdicts(tmp_path, views, places)
+    assert verdicts.behind.count.tolist() == [0 if window else 7, 0]
+    assert verdicts.behind.differs.tolist() == [not window, False]
+    assert not verdicts.before.count.any()
+    verdicts.write(tmp_path / "places.ply")
+    cloud = trimesh.load(tmp_path / "places.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert np.asarray(cloud.colors)[:, :3].tolist() == [[255] * 3 if window else [219, 76, 219], [255] * 3]
+
+
+def test_a_verdict_takes_many_views_and_half_of_those_that_see_a_place():
+    against = np.zeros((20, 4), bool)
+    for place, count in enumerate([MANY, MANY - 1, MANY, 0]):
+        against[5 : 5 + count, place] = True
+    against[2, :2] = True
+    votes = Votes.of(against, np.array([2 * MANY + 2, 2 * MANY, 2 * MANY + 1, 0]))
+    assert votes.count.tolist() == [MANY + 1, MANY, MANY, 0]
+    assert votes.differs.tolist() == [True, True, False, False]
+    assert votes.share == pytest.approx(2 / 3)
+    assert votes.witness == 2
+
+
+def test_verdicts_name_the_views_in_which_much_moved():
+    nothing, none = np.zeros(0), Votes.of(np.zeros((3, 0), bool), np.zeros(0, np.int64))
+    moved = np.array([0.0039, 0.01, 0.2])
+    verdicts = Verdicts(np.zeros((0, 3)), none.count, none, none, nothing, ["a", "b", "c"], moved, nothing)
     assert verdicts.moved_in == ["c", "b"]
 
 
