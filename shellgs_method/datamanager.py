@@ -57,6 +57,9 @@ MAX_MEMORY_SHARE = 0.6
 """Share of the free memory that photographs and maps may take."""
 READERS = 8
 """Threads that read maps before their turn: of 2 megapixels that takes as long as several steps on a GPU."""
+COMPARED, OTHER = 8, 0.3
+"""Photographs whose colours those of the SfM points are compared with, and the median difference, relative to these,
+from which they are others."""
 MAX_GPU_SHARE = 1 / 3
 """Share of the GPU's free memory that training views may take: Gaussians, and what a step needs, take the rest."""
 
@@ -210,6 +213,40 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         on_surface = sightings_on_surface(exposures, points_on_surface(exposures))
         gains = log_gains(of_points.with_others(on_surface), known)
         return gains, of_points.mean_of_views(gains, len(points))
+
+    def colours_of_points(self, log_gains: Float64[np.ndarray, "V 3"]) -> Float[Tensor, "N 3"] | None:
+        """Colours of the SfM points in the training photographs at their mean exposure; None if they have these.
+
+        Points have none, or others, where their program did not extract them, or colours heights or intensities, or
+        where photographs were edited afterwards.
+
+        Args:
+            log_gains: exposures of the photographs.
+        """
+        dataset, points = self.train_dataset, self.sfm_points.float()
+        metadata = self.train_dataparser_outputs.metadata
+        own = metadata["points3D_rgb"].numpy() / 255
+
+        def shown(views: range) -> Float64[np.ndarray, "N 3"]:
+            exposures = [Exposed.of(dataset.camera(k), photograph_of(self.cached_train[k])) for k in views]
+            seen = sightings_of_points(exposures, points, [metadata["observed"][k] for k in views])
+            at_mean = exposed(torch.from_numpy(seen.colour), -torch.from_numpy(log_gains[views][seen.view]))
+            return seen.means(at_mean.clamp(0, 1).numpy(), len(points))
+
+        few = shown(range(0, len(dataset), -(-len(dataset) // COMPARED)))
+        found = np.isfinite(few).all(axis=1)
+        if not found.any():
+            return None
+        apart, coloured = np.median(np.abs(few - own)[found]), (own != own[0]).any()
+        if coloured and apart <= OTHER * np.median(few[found]):
+            return None
+        if coloured:
+            notice(
+                f"the SfM points of {self.config.dataparser.data} have other colours than the photographs, by "
+                f"{255 * apart:.0f} of 255 in the median: Gaussians begin with the photographs'."
+            )
+        colours = shown(range(len(dataset)))
+        return torch.from_numpy(np.where(np.isfinite(colours), colours, np.nanmedian(colours, axis=0))).float()
 
     def seed_views(
         self,

@@ -231,7 +231,10 @@ class FacadeModel(SplatfactoModel):
         """
         assert self.exposures is not None
         self.exposures.start(log_gains)
-        colours = exposed(sfm_points(self.seed_points)[1], -torch.from_numpy(of_points).float())
+        self.colour_points(exposed(sfm_points(self.seed_points)[1], -torch.from_numpy(of_points).float()))
+
+    def colour_points(self, colours: Float[Tensor, "N 3"]) -> None:
+        """Give the Gaussians at the SfM points, the only ones at the start, other colours."""
         self.gauss_params["features_dc"].data = harmonics(colours.clamp(0, 1)).to(self.device)
 
     def start_in(self, coarse: CoarseRun, cameras: Iterable[Camera]) -> None:

@@ -11,6 +11,7 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
 import torchvision
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -103,6 +104,10 @@ class FacadePipeline(VanillaPipeline):
         elif self.model.exposures is not None:
             gains, of_points = data.log_gains()
             self.model.start_exposures(gains, of_points)
+        if self.model.surroundings is None:
+            found = data.colours_of_points(np.zeros((len(data.train_dataset), 3)) if gains is None else gains)
+            if found is not None:
+                self.model.colour_points(found)
         self._add_seeds(partial(data.seed_views, log_gains=gains))
 
     def _start_in_block(self, path: Path) -> None:

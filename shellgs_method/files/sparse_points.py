@@ -105,7 +105,7 @@ def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
         warn_of_coarse(points.step, points.positions, f"the SfM points of {layout.data}")
     if points.colours is None or len(points.colours) == 0 or points.colours.any():
         return points
-    notice(f"{points.called} are all black, as where colours were not extracted: Gaussians begin grey.")
+    notice(f"{points.called} are all black, as if colours were not extracted: Gaussians begin with the photographs'.")
     return replace(points, colours=np.full_like(points.colours, transforms.GREY))
 
 

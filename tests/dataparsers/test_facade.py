@@ -175,7 +175,7 @@ def test_black_points_are_grey_and_told(scene, caplog, kind):
         cloud = trimesh.PointCloud(np.eye(4)[:, :3], np.zeros((4, 3), np.uint8))
         cloud.export(scene / "sparse_pc.ply")
     assert (parse(scene).metadata["points3D_rgb"] == 128).all()
-    assert "are all black, as where colours were not extracted: Gaussians begin grey" in caplog.text
+    assert "are all black, as if colours were not extracted: Gaussians begin with the photographs'" in caplog.text
 
 
 @pytest.mark.parametrize("given", ["k1", "distortion_params"])

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+import trimesh
+from training_runs import model_of, trainer_of
 
-from shellgs_method.gaussians.initial import InitialGaussians
+from shellgs_method.gaussians.initial import DEGREE_0, InitialGaussians
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.rasterizer import quats_to_rotations
 from shellgs_method.render.view import view_colours
+from shellgs_method.trainer import FacadeTrainer
 
 
 def test_every_colour_of_an_initial_gaussian_gets_a_gradient():
@@ -67,3 +73,36 @@ def test_a_gaussian_at_a_seed_lies_flat_on_its_surface():
     plane = torch.eye(3, dtype=torch.float64) - n[:, :, None] * n[:, None]
     expected = along[:, None, None] * plane + thin[:, None, None] * (n[:, :, None] * n[:, None])
     torch.testing.assert_close(covariances, expected, rtol=1e-4, atol=1e-6)
+
+
+def with_colours(scene: Path, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Change the colours of a scene's SfM points; returns what they were, in [0, 1]."""
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    before = np.asarray(cloud.colors)[:, :3]
+    trimesh.PointCloud(cloud.vertices, change(before).astype(np.uint8)).export(scene / "sparse_pc.ply")
+    return before / 255
+
+
+def first_colours(trainer: FacadeTrainer) -> np.ndarray:
+    """Colours of the Gaussians at the SfM points."""
+    return (0.5 + DEGREE_0 * model_of(trainer).gauss_params["features_dc"].detach()).numpy()
+
+
+@pytest.mark.parametrize("method", ["photo_gs", "shellgs_metric"])
+@pytest.mark.parametrize(
+    ("change", "told"), [(np.zeros_like, False), (lambda own: own // 3, True), (lambda own: 255 - own, True)]
+)
+def test_points_without_colours_or_with_others_begin_with_the_photographs(
+    scene, tmp_path, caplog, method, change, told
+):
+    """As of a cloud coloured by its heights, or of photographs that were edited after structure from motion."""
+    own = with_colours(scene, change)
+    begun = first_colours(trainer_of(scene, tmp_path, method))[: len(own)]
+    assert np.median(np.abs(begun - own)) < 0.06
+    assert ("have other colours than the photographs" in caplog.text) == told
+
+
+def test_points_with_the_photographs_colours_keep_theirs(scene, tmp_path):
+    own = with_colours(scene, lambda own: own)
+    np.testing.assert_allclose(first_colours(trainer_of(scene, tmp_path, "photo_gs")), own, atol=1e-5)
