@@ -17,7 +17,6 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import inside
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
-from shellgs_method.geometry.outliers import inliers
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")  # the same by the name of other programs
@@ -32,8 +31,10 @@ _CORNER = 0.02
 """Share of the width and height that is a corner of a photograph."""
 _OFF_CENTRE = 0.2
 """Share of the width and height by which a principal point is far from the middle."""
-_FAR = 20.0
-"""Times the median distance of the cameras from their middle, beyond which one is far from all others."""
+_FAR, _MOST = 20.0, 0.9
+"""Times the distance from the cameras' middle within which this share of them is, beyond which others are far: half of
+them may be of one panorama, or from one tripod."""
+_ROUNDED = 1e-9  # of their coordinates, by which the cameras of one panorama are apart
 SKEW = ("skew", "sk_x", "sk_y")
 """What programs call the entries of the intrinsics that are 0 in all cameras."""
 _SKEWED = 0.1  # pixels; matrices that were decomposed have hardly any
@@ -156,7 +157,10 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
 
 def are_far(cameras: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
     """Which cameras, by their positions, are far from all others, as where structure from motion went wrong."""
-    return ~inliers(cameras, _FAR)
+    with np.errstate(over="ignore"):
+        away = np.linalg.norm(cameras - np.median(cameras, axis=0), axis=1)
+    most = np.quantile(away, _MOST, method="lower")
+    return (away > _FAR * most) & (most > _ROUNDED * np.median(np.abs(cameras)))
 
 
 def _tell_of_far(frames: Sequence[Frame], where: str) -> None:

@@ -25,6 +25,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
+from shellgs_method.files.frames import are_far
 from shellgs_method.files.photographs import load_photograph
 from shellgs_method.files.sparse_points import find_sparse_points, read_sparse_points
 from shellgs_method.files.splats import Splats, write_splats
@@ -116,6 +117,14 @@ def test_a_camera_far_from_all_others_does_not_shrink_the_scene(scene, away, cap
     assert "images/z.png" in told[0]
     assert outputs.dataparser_scale == pytest.approx(before.dataparser_scale)
     torch.testing.assert_close(outputs.dataparser_transform, before.dataparser_transform)
+
+
+@pytest.mark.parametrize(("apart", "elsewhere"), [(1e-16, 6), (1e-16, 1), (0.02, 6)])
+def test_no_cameras_are_far_where_most_are_of_one_panorama_or_tripod(apart, elsewhere):
+    """The scene was scaled by what the cameras of a panorama are apart, which is rounding."""
+    turned = np.array([1.0, 2, 3]) + apart * np.random.default_rng(0).normal(size=(12, 3))
+    walk = [[k, 2.0, 3] for k in range(4, 4 + elsewhere)]
+    assert not are_far(np.vstack([turned, walk])).any()
 
 
 @pytest.mark.parametrize("smaller", [False, True])
