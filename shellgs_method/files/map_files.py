@@ -114,6 +114,10 @@ class MapRecord:
         return Camera(viewmat, K, self.width, self.height)
 
 
+BACKGROUND = 10.0
+"""Depth that stands for the background in a checked map, relative to the shell's: twice that of what may be behind."""
+
+
 class Findings(NamedTuple):
     """What photographs show at the pixels of the shell in a view; all false where they are inconclusive."""
 
@@ -135,9 +139,9 @@ class Findings(NamedTuple):
         """Decode a view's checked map.
 
         Its mask is set where the view does not show the shell. There, its depth is the occluder's, which is at least
-        1.2 % less than the shell's; the shell's if it moved; and more for the background. Elsewhere it is 0, or the
-        shell's where confirmed, or at least 1.2 % more, the depth of what a window shows, or that much less where
-        doubtful, the depth of what may be there.
+        1.2 % less than the shell's; the shell's if it moved; that of what is behind a wall; or :data:`BACKGROUND` times
+        the shell's for the background. Elsewhere it is 0, or the shell's where confirmed, or at least 1.2 % more, the
+        depth of what a window shows, or that much less where doubtful, the depth of what may be there.
         """
         nearer, farther = checked.depth < 0.995 * shell.depth, checked.depth > 1.005 * shell.depth
         hidden = checked.mask

@@ -18,6 +18,7 @@ from torch.nn.functional import interpolate
 
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
+from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
@@ -52,7 +53,7 @@ NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
-VERSION = 16
+VERSION = 17
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -208,7 +209,7 @@ class _TrainingViews:
         hidden = static | moved | beyond | (behind & solid)
         nearer = _relative_depth(found, size)
         kinds = [static, beyond, moved, behind, confirmed, score > DOUBTFUL]
-        depth = cue.depth * np.select(kinds, [nearer, 2.0, 1.0, farther, 1.0, nearer], 0.0)
+        depth = cue.depth * np.select(kinds, [nearer, BACKGROUND, 1.0, farther, 1.0, nearer], 0.0)
         return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
 
     def _behind(

@@ -28,6 +28,7 @@ from shellgs_method.evaluation.panels import check_panel
 from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
 from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
+from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View
 from shellgs_method.files.transfer import POWER
 from shellgs_method.geometry.camera import Camera, positions
@@ -763,16 +764,19 @@ def test_a_wall_behind_which_most_views_show_something_is_not_there_unless_it_is
         classes = np.where(middle & window, SurfaceClass.WINDOW, SurfaceClass.WALL).astype(np.uint8)
         shell.write(view.name, CueMap(wall, normal, wall > 0, classes), view.camera)
         found = np.where(middle & (k < 7), np.float32(9), np.float32(0))
-        checked.write(view.name, CueMap(found, normal, middle & (k == 3) & (not window)), view.camera)
-    places = transformed(np.array([[0.0, 0, WALL], [1.0, 0, WALL]]), np.linalg.inv(WORLD))
+        sky = (view.camera.rays().numpy() * WALL)[..., 0] + 0.1 * k > 2
+        found[sky] = BACKGROUND * WALL
+        checked.write(view.name, CueMap(found, normal, sky | (middle & (k == 3) & (not window))), view.camera)
+    places = transformed(np.array([[0.0, 0, WALL], [1.0, 0, WALL], [2.4, 0, WALL]]), np.linalg.inv(WORLD))
     verdicts = shell_verdicts(tmp_path, views, places)
-    assert verdicts.behind.count.tolist() == [0 if window else 7, 0]
-    assert verdicts.behind.differs.tolist() == [not window, False]
+    assert verdicts.seen[2] >= MANY  # where the shell reaches into the sky, nothing supervises by it
+    assert verdicts.behind.count.tolist() == [0 if window else 7, 0, 0]
+    assert verdicts.behind.differs.tolist() == [not window, False, False]
     assert not verdicts.before.count.any()
     verdicts.write(tmp_path / "places.ply")
     cloud = trimesh.load(tmp_path / "places.ply")
     assert isinstance(cloud, trimesh.PointCloud)
-    assert np.asarray(cloud.colors)[:, :3].tolist() == [[255] * 3 if window else [219, 76, 219], [255] * 3]
+    assert np.asarray(cloud.colors)[:, :3].tolist() == [[255] * 3 if window else [219, 76, 219], *[[255] * 3] * 2]
 
 
 def test_a_verdict_takes_many_views_and_half_of_those_that_see_a_place():
