@@ -37,7 +37,7 @@ them may be of one panorama, or from one tripod."""
 _ROUNDED = 1e-9  # of their coordinates, by which the cameras of one panorama are apart
 SKEW = ("skew", "sk_x", "sk_y")
 """What programs call the entries of the intrinsics that are 0 in all cameras."""
-_SKEWED = 0.1  # pixels; matrices that were decomposed have hardly any
+_OFF = 0.5  # pixels by which a skew, or p1 and p2 of a fisheye lens, may move the edges: no camera is known better
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
@@ -111,14 +111,16 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
             f"{angle:.0f}°: give them in pixels, not in millimetres or as a share of the width"
         )
     distortion = tuple(number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
-    for key in (*(("p1", "p2") if fisheye else ("k4",)), *OTHER_COEFFICIENTS):
+    for key in OTHER_COEFFICIENTS if fisheye else ("k4", *OTHER_COEFFICIENTS):
         if key in lens and number(lens, key, where) != 0:
             raise SceneError(f"{where} has the coefficient {key}, which nerfstudio cannot undistort; {UNDISTORT}")
-    for key in SKEW:
-        if key in lens and (off := abs(number(lens, key, where)) * height / 2 / fy) > _SKEWED:
+    tangential = 3 * max(fx, fy) * ((width / fx) ** 2 + (height / fy) ** 2) / 4  # of 1, in a corner
+    for key in (*SKEW, "p1", "p2") if fisheye else SKEW:
+        most = height / 2 / fy if key in SKEW else tangential
+        if key in lens and (off := abs(number(lens, key, where)) * most) > _OFF:
             raise SceneError(
-                f"{where} has the skew {key}, by which its edges are {off:.2g} pixels off, and which nerfstudio does "
-                "not know: calibrate it without"
+                f"{where} has a {key} by which its edges are {off:.2g} pixels off, and which nerfstudio does not know: "
+                "calibrate it without"
             )
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
