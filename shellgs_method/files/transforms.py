@@ -65,7 +65,7 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     named = {split: _names(meta.get(f"{split}_filenames", []), files, path) for split in _SPLITS}
     listed = {split: names for split, names in named.items() if names}  # an empty list says that the split has none
     files.tell_what_is_elsewhere()
-    _tell_of_unread({key for source in (meta, *listed_frames) for key in source}, path)
+    _tell_of_unread((meta, *listed_frames), path)
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
@@ -74,10 +74,11 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     return Recording(in_order(frames, str(path)), applied, listed, orientation)
 
 
-def _tell_of_unread(keys: set[str], path: Path) -> None:
-    """Tell the user of what may be a part of the lens, under names that nerfstudio does not have."""
-    known = {*_LENS, *COEFFICIENTS, *OTHER_COEFFICIENTS, _LISTED}
-    if unread := sorted(key for key in keys - known if _UNREAD.fullmatch(key.lower())):
+def _tell_of_unread(sources: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Tell the user of what may be a part of the lens, under names that nerfstudio does not have, and is not 0."""
+    keys = {key for source in sources for key in source} - {*_LENS, *COEFFICIENTS, *OTHER_COEFFICIENTS, _LISTED}
+    named = sorted(key for key in keys if _UNREAD.fullmatch(key.lower()))
+    if unread := [key for key in named if any(re.search("[1-9]", str(source.get(key))) for source in sources)]:
         notice(
             f"{path} has {' and '.join(unread)} of lenses, which is not read: give it as fl_x, fl_y, cx, cy, k1 to k4, "
             "p1 and p2, if these do not say it already."

@@ -118,7 +118,8 @@ def test_a_fisheye_lens_may_be_called_so_alone(scene: Path):
 
 @pytest.mark.parametrize("key", ["K", "intrinsics", "dist_coeffs", "distortion", "K1", "k_1", "x_fov"])
 def test_what_is_not_read_of_a_lens_is_told(scene: Path, key: str, caplog: pytest.LogCaptureFixture):
-    with_lens(scene, "OPENCV", BROWN | {"aabb_scale": 16, "fisheye_crop_radius": 9})
+    nothing = {"distortion": [0, 0.0], "dist": None, "distortion_model": "opencv"}
+    with_lens(scene, "OPENCV", BROWN | {"aabb_scale": 16, "fisheye_crop_radius": 9} | nothing)
     assert "is not read" not in caplog.text
     with_lens(scene, "OPENCV", {key: 0.1})
     assert f"transforms.json has {key} of lenses, which is not read: give it as fl_x" in caplog.text
