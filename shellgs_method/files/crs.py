@@ -186,7 +186,10 @@ def _zone(crs: CRS, path: Path) -> tuple[CRS, list[int]] | None:
         return None
     x, y = corner[0, orders[0]]
     zones = query_utm_crs_info(crs.geodetic_crs.name, AreaOfInterest(x, y, x, y))
-    return (CRS.from_epsg(zones[0].code), orders[0]) if zones else None
+    if not zones:
+        return None
+    zone = min(zones, key=lambda zone: len(zone.name))  # of ETRS89, without "(N-E)"
+    return CRS.from_epsg(zone.code), orders[0]
 
 
 def _first_in(path: Path, pattern: re.Pattern[bytes]) -> str:

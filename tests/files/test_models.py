@@ -324,13 +324,22 @@ def in_degrees(path: Path, system: str, order: Sequence[int], zone: str, place: 
     return faces
 
 
-@pytest.mark.parametrize("order", [[1, 0, 2], [0, 1, 2]])
-def test_a_citygml_in_degrees_is_read_in_metres(tmp_path: Path, caplog, order: Sequence[int]):
+@pytest.mark.parametrize(
+    ("order", "degrees", "metres", "place"),
+    [
+        ([1, 0, 2], "EPSG:6697", "EPSG:6691", (385_000, 3_902_000, 2)),
+        ([0, 1, 2], "EPSG:6697", "EPSG:6691", (385_000, 3_902_000, 2)),
+        ([1, 0, 2], "EPSG:4937", "EPSG:25832", (410_000, 5_413_000, 2)),
+    ],
+)
+def test_a_citygml_in_degrees_is_read_in_metres(
+    tmp_path: Path, caplog, order: Sequence[int], degrees: str, metres: str, place: tuple[float, float, float]
+):
     path = tmp_path / "a.gml"
-    faces = in_degrees(path, "EPSG:6697", order, "EPSG:6691", (385_000, 3_902_000, 2))
+    faces = in_degrees(path, degrees, order, metres, place)
     assert_cast_as(path, faces)
-    assert crs_of(path) == "EPSG:6691"
-    assert "is read in metres of JGD2011 / UTM zone 54N" in caplog.text
+    assert crs_of(path) == metres
+    assert f"is read in metres of {CRS(metres).name}." in caplog.text
 
 
 def test_a_citygml_in_degrees_of_which_either_may_be_the_latitude_is_refused(tmp_path: Path):
