@@ -414,6 +414,14 @@ def test_a_list_of_a_ply_is_no_colour_and_no_coordinate(tmp_path: Path):
         read_geometry(save_ply(tmp_path / "b.ply", ["element vertex 6", *lists, *face], data, "ascii"))
 
 
+def test_a_binary_ply_that_claims_more_than_it_holds_is_refused_at_once(tmp_path: Path):
+    BOX.export(tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"element vertex 8\n", b"element vertex 4000000000\n"))
+    with pytest.raises(SceneError, match=r"its header claims at least \d+ bytes, but it has \d+"):
+        read_geometry(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("extra", ["0.5\n", "word\n"])
 def test_an_ascii_ply_with_other_numbers_than_its_header_claims_is_refused(tmp_path: Path, extra: str):
     header = ["element vertex 6", *XYZ, "element face 1", INDICES]
@@ -718,7 +726,8 @@ def test_names_of_fields_may_be_in_capitals(tmp_path: Path):
     data = (tmp_path / "a.ply").read_bytes()
     for axis in (b"x", b"y", b"z"):
         data = data.replace(b"float " + axis + b"\n", b"float " + axis.upper() + b"\n", 1)
-    (tmp_path / "a.ply").write_bytes(data)
+    assert b" vertex_indices\n" in data
+    (tmp_path / "a.ply").write_bytes(data.replace(b" vertex_indices\n", b" Vertex_Indices\n"))
     assert_same_surface(read_geometry(tmp_path / "a.ply"))
 
 
@@ -1128,6 +1137,20 @@ def test_what_fills_up_a_las_is_no_point(tmp_path: Path):
     with (tmp_path / "a.las").open("ab") as file:
         file.write(bytes(10 * las.header.point_format.size))
     assert len(read_geometry(tmp_path / "a.las").vertices) == len(POINTS)
+
+
+def test_records_after_the_points_of_a_las_are_no_points_and_must_be_there(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("a program", 1, "", b"1" * (4 * las.point_format.size - 60))])
+    las.write(str(tmp_path / "a.las"))
+    assert len(read_geometry(tmp_path / "a.las").vertices) == len(POINTS)
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[243:247] = (1000).to_bytes(4, "little")
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(SceneError, match="claims 1000 records after its points"):
+        read_geometry(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize("kind", [3, 6])
