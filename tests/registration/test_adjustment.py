@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -305,6 +306,12 @@ def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: S
     report = (tmp_path / "shell/report/index.html").read_text()
     assert "Cameras adjusted to the shell" in report
     assert all(view.name in report for view in views)
+    table = report.partition("<h2>Cameras adjusted to the shell")[2].partition("<h2>")[0]
+    moved = [float(moved) for moved in re.findall(r"<tr><td>[^<]*</td><td>([\d.]+) cm", table)]
+    assert moved == sorted(moved, reverse=True)
+    assert len(moved) == len(views)
+    shown = [path.stem.rpartition("_")[2] for path in (tmp_path / "shell/report").glob("view_*.png")]
+    assert len({*shown}) == len(shown) == 14
     assert {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()} == files
 
     with pytest.raises(SceneError, match="--refine would move the shell from where the cameras were adjusted to it"):

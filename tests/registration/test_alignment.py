@@ -39,7 +39,7 @@ from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
 from shellgs_method.registration.correspondences import fit_robustly
 from shellgs_method.registration.geotags import GeoTags
-from shellgs_method.registration.orientations import scene_axes
+from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
 from shellgs_method.registration.proposal import Candidate
@@ -360,6 +360,18 @@ def test_the_main_wall_is_the_same_in_each_run():
     found = [scene_axes(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
     assert len({axes.tobytes() for axes in found}) == 1
     assert np.degrees(np.arccos(-found[0][2, 1])) < 1
+
+
+@pytest.mark.parametrize("first", [0.0, 20.0])
+def test_the_walls_of_both_wings_of_a_bent_building_are_tried(first: float):
+    """The larger wing's normals scatter over the neighbouring degrees too, and around 0° over those below 90°."""
+    random = np.random.default_rng(0)
+    headings = np.radians(random.normal(np.repeat([first, first + 30], [6000, 4000]), 1.5))
+    walls = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=1)
+    normals = np.concatenate([walls, np.tile([0.0, 0, 1], (2000, 1))])
+    out = np.array([axes[2] for axes in shell_axes(normals) if axes[1, 2] > 0.99])
+    for wing in np.radians([first, first + 30]):
+        assert np.degrees(np.arccos((out @ [np.cos(wing), np.sin(wing), 0]).clip(-1, 1).max())) < 0.9
 
 
 def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
