@@ -77,6 +77,9 @@ PROGRAMS = {
     "an import": "!!python/module:antigravity ''",
     "an import by a name": "!!python/name:antigravity.fly ''",
     "a class that is no config": "!!python/object:pathlib.Path {{}}",
+    "an offer to install": "!!python/object:nerfstudio.configs.external_methods.ExternalMethodDummyTrainerConfig\n"
+    "method_name: a\nmethod: !!python/object:nerfstudio.configs.external_methods.ExternalMethod "
+    "{{instructions: '', configurations: [], pip_package: '; touch {mark}'}}",
     "a generic that is none": "!!python/object/apply:_operator.getitem [[1], 0]",
 }
 
@@ -138,6 +141,13 @@ def test_an_older_config_has_defaults_for_new_settings_and_drops_those_that_are_
     model = load_config(run / "config.yml").pipeline.model
     assert getattr(model, "init") == "sfm"  # noqa: B009
     assert not hasattr(model, "of_an_earlier_build")
+
+
+def test_a_setting_that_is_no_number_may_be_null(run):
+    text = (run / "config.yml").read_text()
+    assert "project_name: nerfstudio-project\n" in text
+    (run / "config.yml").write_text(text.replace("project_name: nerfstudio-project\n", "project_name: null\n"))
+    assert load_config(run / "config.yml").project_name is None
 
 
 RELEASED = Path(__file__).parent / "shellgs-metric-0.2.0.yml"
