@@ -235,7 +235,7 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         console.print(
             f"Behind {verdicts.behind.share:.1%} of the shell, as many photographs show something else: look at "
             f"{verdicts.views[verdicts.behind.witness]}, and at {places}, magenta there. If that is no glass, the "
-            "building lacks this part of the shell, or stands back: take it out, as it draws the surface there.",
+            "building lacks this part of the shell, or stands back: take it out of the shell.",
             style="yellow",
         )
     if verdicts.moved_in:
