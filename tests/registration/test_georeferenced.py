@@ -19,7 +19,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
-NATIONAL = np.array([410_123.25, 5_413_987.5, 250.125])
+NATIONAL = np.array([-743_123.25, -1_043_987.5, 0.125])  # metres south and west, as in EPSG:5514
 MILLIMETRE = 1e-3
 
 
@@ -125,6 +125,6 @@ def test_exports_of_a_national_scene_agree_with_those_of_the_local_one(national,
 
 def test_exports_without_a_shell_are_offset_by_whole_hundreds():
     frame = scene_frame(middle=NATIONAL)
-    np.testing.assert_array_equal(frame.offset, [410_100, 5_414_000, 300])
+    np.testing.assert_array_equal(frame.offset, [-743_100, -1_044_000, 0])
     np.testing.assert_allclose(frame.to_scene @ [*(NATIONAL - frame.offset), 1], [*NATIONAL, 1])
     assert not scene_frame(middle=np.array([3.0, 4.0, 5.0])).offset.any()
