@@ -35,7 +35,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory, free_memory
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import ahead
-from shellgs_method.occlusion import compared_others
+from shellgs_method.occlusion import DARK, compared_others
 from shellgs_method.occlusion.exposure import (
     Exposed,
     exposed,
@@ -60,6 +60,8 @@ READERS = 8
 COMPARED, OTHER = 8, 0.3
 """Photographs whose colours those of the SfM points are compared with, and the median difference, relative to these,
 from which they are others."""
+BLACK = 4
+"""Brightness, of 255, up to which a pixel shows nothing."""
 MAX_GPU_SHARE = 1 / 3
 """Share of the GPU's free memory that training views may take: Gaussians, and what a step needs, take the rest."""
 
@@ -193,6 +195,19 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         if "shell" not in metadata["cues"]:
             raise SceneError("a holdout needs the shell maps of the scene: run `shellgs cast SCENE` first")
         return facade_holdout(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
+
+    @cached_property
+    def light(self) -> float:
+        """What brings the training photographs to the least brightness of day: 1, if they are no darker."""
+        medians = []
+        for batch in self.cached_train:
+            grey = 255 * photograph_of(batch)[::4, ::4].mean(dim=-1)
+            shown = grey > BLACK  # not around an object that was cut out
+            if "mask" in batch:
+                shown &= batch["mask"][::4, ::4, 0].to(shown)
+            if shown.any():
+                medians.append(float(grey[shown].median()))
+        return max(1.0, DARK / float(np.median(medians))) if medians else 1.0
 
     def log_gains(self) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "N 3"]]:
         """Exposures of the training photographs, by their colours of the same points, or else by their EXIF data.

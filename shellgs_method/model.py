@@ -451,7 +451,7 @@ class FacadeModel(SplatfactoModel):
         """Metrics of a training view, in the steps in which they are logged."""
         if self.training and self.step % self.log_every > 0:
             return {}
-        target = self._view(batch).photometric.target
+        target = self._view(batch).photometric.target / self.objective.light
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
         metrics = {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
@@ -467,9 +467,10 @@ class FacadeModel(SplatfactoModel):
     def _transient(self, view: ViewLosses, index: int, rgb: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
         if self.transients is None or self.geometry is None or self.step < TRANSIENTS_FROM * self.num_iterations:
             return None
-        images = view.photometric.target, rgb.detach()
+        images = view.photometric.target / self.objective.light, rgb.detach()
         if self.exposures is not None:
             images = (exposed(image, -self.exposures.log_gains[index].detach()) for image in images)
+        images = map(self.objective.as_by_day, images)
         return self.transients(index, *images, self.geometry.depth.detach(), self.geometry.camera)
 
     def _view(self, batch: dict) -> ViewLosses:

@@ -83,6 +83,7 @@ class FacadePipeline(VanillaPipeline):
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
             if self.test_mode == "val":  # a trained run loads all its Gaussians
                 datamanager.train_on(model.config.training_cues)
+                model.objective.light = datamanager.light
                 self._start()
 
     def _start(self) -> None:

@@ -104,6 +104,10 @@ class Objective:
         extra: terms beyond the paper.
         metres_per_unit: metres per unit of the world; None if unknown.
         shell_error: error of the shell's alignment in metres; None if unknown.
+
+    Attributes:
+        light: what photographs and renders are multiplied by in R: more than 1 where there is little light, so that it
+            weighs as much against the other terms, and densifies as much, as by day.
     """
 
     def __init__(
@@ -117,6 +121,7 @@ class Objective:
     ):
         self.cues, self.trust, self.paper, self.extra = cues, trust, paper, extra
         self.metres_per_unit, self.shell_error = metres_per_unit, shell_error
+        self.light = 1.0
         self._views: dict[int, ViewLosses] = {}
         self._room: float | None = None
 
@@ -140,10 +145,14 @@ class Objective:
             trust = shell_trust(batch, maps.mask) if doubted else maps.mask.to(target)
             cue = CueLosses(maps, trust, self.paper, self.extra, self.metres_per_unit, self.shell_error)
         own = SelfLosses(kept_pixels(batch, target), with_cue, self.extra)
-        view = ViewLosses(PhotometricLoss(target, kept), own, cue)
+        view = ViewLosses(PhotometricLoss(self.as_by_day(target), kept), own, cue)
         if keep and self._has_room(target):
             self._views[index] = view
         return view
+
+    def as_by_day(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """A photograph or render as R compares it, which may exceed 1."""
+        return image if self.light == 1 else self.light * image
 
     def _has_room(self, image: Float[Tensor, "H W 3"]) -> bool:
         """Whether the losses of one more view may be kept; if so, they count."""
@@ -167,7 +176,7 @@ class Objective:
 
         R leaves out the pixels that are ``transient``.
         """
-        losses = {"photometric": view.photometric(rgb, transient)}
+        losses = {"photometric": view.photometric(self.as_by_day(rgb), transient)}
         if geometry is not None:
             losses |= view.own(geometry, progress)
             if view.cue is not None:
