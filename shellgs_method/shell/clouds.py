@@ -164,7 +164,8 @@ def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray, k
     towards = viewpoints[point_tree(viewpoints).query(points)[1]] - points if len(viewpoints) else known
     if towards is not None:
         return np.where(np.einsum("nc,nc->n", normals, towards)[:, None] < 0, -normals, normals)
-    if np.ptp(points @ normals[0]) < 1e-9 * np.ptp(points):  # exactly flat: Open3D needs tetrahedra of neighbours
+    # Exactly flat, where Open3D needs tetrahedra of neighbours; any three points are.
+    if len(points) > 3 and np.ptp(points @ normals[0]) < 1e-9 * np.ptp(points):
         return np.tile(normals[0], (len(points), 1))
     legacy = _legacy(points, normals)
     legacy.orient_normals_consistent_tangent_plane(min(10, len(points) - 1))
