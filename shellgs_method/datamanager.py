@@ -29,13 +29,14 @@ from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.photographs import exif_log_gains
+from shellgs_method.files.transfer import DARK
 from shellgs_method.gaussians.seeds import SeededView, photograph_of, view_of_surface
 from shellgs_method.gaussians.skybox import SkyView
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory, free_memory
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import ahead
-from shellgs_method.occlusion import DARK, compared_others
+from shellgs_method.occlusion import compared_others
 from shellgs_method.occlusion.exposure import (
     Exposed,
     exposed,

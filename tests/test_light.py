@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from training_runs import data_of, model_of, trainer_of
 
+from shellgs_method.files.transfer import DARK
 from shellgs_method.losses.photometric import PhotometricLoss
-from shellgs_method.occlusion import DARK
 
 
 def repaint(scene: Path, paint: Callable[[np.ndarray], np.ndarray]) -> None:

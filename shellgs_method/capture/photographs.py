@@ -36,9 +36,10 @@ from shellgs_method.files.paths import (
     tell_of_masks,
 )
 from shellgs_method.files.profiles import is_srgb
+from shellgs_method.files.transfer import DARK
 
 _EXCERPT = 4096  # bytes
-_THUMBNAIL, _BRIGHT = 320, 90  # pixels of a photograph whose brightness is measured; its median, of 255, by day
+_THUMBNAIL = 320  # pixels of a photograph whose brightness is measured
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
 _PLACEHOLDER = ".icloud"  # of a hidden file in the place of one that macOS keeps elsewhere: .IMG_0001.HEIC.icloud
@@ -413,7 +414,7 @@ def contrast(path: Path) -> float:
         image.draft("L", (_THUMBNAIL, _THUMBNAIL))
         grey = image.convert("L")
         grey.thumbnail((_THUMBNAIL, _THUMBNAIL))
-    return min(1.0, 2.0 ** round(np.log2(max(float(np.median(np.asarray(grey))), 1.0) / _BRIGHT)))
+    return min(1.0, 2.0 ** round(np.log2(max(float(np.median(np.asarray(grey))), 1.0) / DARK)))
 
 
 def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:

@@ -15,6 +15,8 @@ HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
 """Transfer functions of HDR by their codes in files (transfer characteristics of ITU-T H.273)."""
 OFFSET, POWER = 0.055, 1 / 2.4
 """sRGB's curve above its toe, x = 1.055 l^(1/2.4) - 0.055 (IEC 61966-2-1)."""
+DARK = 90
+"""Median of a photograph's stored brightness, of 255, below which it is of little light: those by day have more."""
 
 _WHITE = 203.0  # nits of diffuse white (ITU-R BT.2408)
 _PEAK = 1000.0  # nits of the display that HLG is graded on (ITU-R BT.2100)

@@ -1,12 +1,10 @@
 """What photographs say against the shell."""
 
 from shellgs_method.occlusion.check import check_views, compared_others
-from shellgs_method.occlusion.low_light import DARK
 from shellgs_method.occlusion.verdicts import CONTRADICTED_PLACES, MANY, UNCLEAR, shell_verdicts
 
 __all__ = [
     "CONTRADICTED_PLACES",
-    "DARK",
     "MANY",
     "UNCLEAR",
     "check_views",

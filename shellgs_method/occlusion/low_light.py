@@ -16,12 +16,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from shellgs_method.files.transfer import POWER
+from shellgs_method.files.transfer import DARK, POWER
 from shellgs_method.occlusion.contradiction import ShellView
 from shellgs_method.occlusion.exposure import BLACK, exposed_image
 
-DARK = 90
-"""Median of the shell's brightness, of 255, below which photographs are brought to it."""
 NOISY = 9
 """Standard deviation of the noise of their mean colour, of 255, above which they are blurred: by less, thin things are
 lost."""

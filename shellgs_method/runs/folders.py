@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 try:
@@ -13,20 +13,15 @@ except ImportError:  # Windows, where nothing is locked
     fcntl = None
 
 
-_CLAIMED: dict[Path, AbstractContextManager[bool]] = {}
+_LOCKS, _CLAIMED = ExitStack(), set[Path]()
 
 
 def claimed(folder: Path) -> bool:
     """Lock a folder until this process ends; False where another process has it."""
     folder = folder.resolve()
-    if folder in _CLAIMED:
-        return True
-    lock = held(folder)
-    if not lock.__enter__():
-        lock.__exit__(None, None, None)
-        return False
-    _CLAIMED[folder] = lock
-    return True
+    if folder not in _CLAIMED and _LOCKS.enter_context(held(folder)):
+        _CLAIMED.add(folder)
+    return folder in _CLAIMED
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View
-from shellgs_method.files.transfer import POWER
+from shellgs_method.files.transfer import DARK, POWER
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -53,7 +53,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
-from shellgs_method.occlusion.low_light import BLUR, DARK, LowLight, noise
+from shellgs_method.occlusion.low_light import BLUR, LowLight, noise
 from shellgs_method.occlusion.neighbours import MOVES, MOVES_ON, neighbours, offsets_before, sides
 from shellgs_method.occlusion.verdicts import Verdicts, Votes
 from shellgs_method.viewer import ContradictedShell
