@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import time
 from dataclasses import replace
@@ -214,7 +215,14 @@ def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], u
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.facade import held_out_names, read_views
-    from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, UNCLEAR, check_views, shell_verdicts
+    from shellgs_method.occlusion import (
+        CONTRADICTED_PLACES,
+        MANY,
+        UNCLEAR,
+        check_views,
+        read_displaced,
+        shell_verdicts,
+    )
 
     views = read_views(config)
     found = check_views(scene, views, held_out_names(config))
@@ -222,6 +230,14 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         f"Photographs contradict {found.contradicted:.1%} of these pixels: they show an occluder or the background "
         f"({found.checked} views compared, {found.skipped} already there, in {found.seconds:.1f} s)."
     )
+    if displaced := read_displaced(scene):
+        name, (right, down) = next(iter(displaced.items()))
+        console.print(
+            "Photographs that do not show the building where the others and their own cameras put it: "
+            f"{len(displaced)}, {name} by {math.hypot(right, down):.0f} pixels, for example. Their cameras are wrong, "
+            "or are those of other photographs: leave them out, or find their cameras again.",
+            style="yellow",
+        )
     verdicts = shell_verdicts(scene, views)
     places = scene / CONTRADICTED_PLACES
     verdicts.write(places)

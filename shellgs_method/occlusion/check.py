@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import time
 from collections.abc import Collection, Sequence
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
+from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, write_whole
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
 from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View, load_mask, load_photograph
@@ -36,6 +37,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep,
     sweep_behind,
 )
+from shellgs_method.occlusion.displaced import DISPLACED, displacements
 from shellgs_method.occlusion.exposure import (
     Exposed,
     SurfaceColours,
@@ -120,6 +122,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
             compared = track(pool.map(compare, missing), "Comparing the photographs", len(missing))
             for view, cue in zip(missing, compared, strict=True):
                 maps.write(view.name, cue, cameras[view.name])
+        write_whole(scene / DISPLACED, json.dumps(training.displaced(views, shell), indent=1))
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
@@ -185,12 +188,8 @@ class _TrainingViews:
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
-        if view.name in self.views:
-            seen, found = self.views[view.name], self.sweeps[view.name]
-        else:
-            seen = _shell_view(view, cue)
-            seen = self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
-            found = sweep(seen, list(self.views.values()))
+        seen = self._comparable(view, cue)
+        found = self.sweeps[view.name] if view.name in self.views else sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
         agreed = agreement(seen, found, others, found_there)
@@ -211,6 +210,24 @@ class _TrainingViews:
         kinds = [static, beyond, moved, behind, confirmed, score > DOUBTFUL]
         depth = cue.depth * np.select(kinds, [nearer, BACKGROUND, 1.0, farther, 1.0, nearer], 0.0)
         return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
+
+    def displaced(self, views: Sequence[View], shell: CueMaps) -> dict[str, list[int]]:
+        """Pixels of the photographs by which those are displaced that do not show the shell where the others do."""
+        size = shell.manifest.max_image_size
+        seen = [self._comparable(view, shell.require(view.name, view.camera.shrunk(size))) for view in views]
+        found = displacements([_exposed(each) for each in seen], np.array([view.name in self.views for view in views]))
+        return {
+            view.name: np.rint(moved * max(view.camera.width, view.camera.height)).astype(int).tolist()
+            for view, moved in zip(views, found, strict=True)
+            if moved.any()
+        }
+
+    def _comparable(self, view: View, cue: CueMap) -> ShellView:
+        """A view at the mean exposure, and brightened as the training views are."""
+        if view.name in self.views:
+            return self.views[view.name]
+        seen = _shell_view(view, cue)
+        return self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
 
     def _behind(
         self, seen: ShellView, size: tuple[int, ...]

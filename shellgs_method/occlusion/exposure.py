@@ -102,9 +102,9 @@ class Sightings(NamedTuple):
         return np.log((self.colour - BLACK) / (1 - BLACK)) / POWER
 
 
-def points_on_surface(views: Sequence[Exposed]) -> Float[Tensor, "N 3"]:
-    """Points spread over the surface that the views show."""
-    return torch.cat([_spread(view, MAX_PROJECTIONS / len(views) ** 2) for view in views])
+def points_on_surface(views: Sequence[Exposed], most: int = MAX_PROJECTIONS) -> Float[Tensor, "N 3"]:
+    """Points spread over the surface that the views show, ``most`` projections into all of them."""
+    return torch.cat([_spread(view, most / len(views) ** 2) for view in views])
 
 
 def sightings_on_surface(views: Sequence[Exposed], points: Float[Tensor, "N 3"]) -> Sightings:

@@ -1,0 +1,96 @@
+"""Find photographs that show the building elsewhere than their cameras do.
+
+One camera may be wrong where all others are right: structure from motion mistakes one bay of a facade for another, or
+photographs and poses are not in the same order. Such a photograph spoils the images of all that it shows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+
+from shellgs_method.occlusion.exposure import Exposed, points_on_surface, sightings_on_surface
+
+DISPLACED = "cues/checked/displaced.json"
+"""File in the scene's folder: pixels by which photographs are displaced, right and down, by their names."""
+GAIN = 0.12
+"""Share of its correlation that a displaced photograph gains where it fits best: of those of other poses 94 to 99 % do,
+of those turned by 1 and 2 degrees 77 to 100 and 97 to 100 %. Right ones gain 0.02, and up to 0.113 where the shell is
+30 cm too far forward."""
+LEAST = 0.008
+"""Share of the longer side that counts as a displacement: right photographs reach a pixel of 320."""
+_REACH = 0.15  # of the longer side: largest displacement that is tried
+_OTHERS = 2  # photographs that must tell a point's colour, besides the one that is judged
+_SOME = 0.25  # correlation below which a gain is not relative any more: that of chance
+_FEW = 200  # points that tell nothing
+_MOST = 4_000_000  # projections of points into views
+
+
+def displacements(views: Sequence[Exposed], training: Bool[np.ndarray, " V"]) -> Float64[np.ndarray, "V 2"]:
+    """How far photographs are displaced, right and down, from what others show of the surface; 0 if they are not.
+
+    Points of the surface have the mean colour of the training views that show them, but for the one that is judged.
+    What it should show is compared with the photograph by normalized cross-correlation.
+
+    Args:
+        views: the views, at a mean exposure.
+        training: whether each is a training view: held-out ones tell nothing of others.
+
+    Returns:
+        Displacements in shares of the longer side.
+    """
+    points = points_on_surface(views, _MOST)
+    seen = sightings_on_surface(views, points)
+    grey, tells = seen.colour.mean(axis=1), training[seen.view]
+    others = np.bincount(seen.point, tells, len(points))[seen.point] - tells
+    sums = np.bincount(seen.point, tells * grey, len(points))[seen.point] - tells * grey
+    found = np.zeros((len(views), 2))
+    for k, view in enumerate(views):
+        told = (seen.view == k) & (others >= _OTHERS)
+        pixels, _ = view.camera.project(points[torch.from_numpy(seen.point[told])])
+        expected = sums[told] / others[told]
+        moved, here, there = _displacement(view.image.mean(dim=-1).numpy(), pixels.long().numpy(), expected)
+        share = np.array(moved) / max(view.camera.width, view.camera.height)
+        if there - here > GAIN * max(here, _SOME) and np.abs(share).max() > LEAST:
+            found[k] = share
+    return found
+
+
+def read_displaced(scene: Path) -> dict[str, tuple[int, int]]:
+    """Pixels by which photographs are displaced, by name, the farthest first; empty if that was not looked for."""
+    path = scene / DISPLACED
+    found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return dict(sorted(found.items(), key=lambda each: -float(np.hypot(*each[1]))))
+
+
+def _displacement(
+    image: Float[np.ndarray, "H W"], pixels: Int[np.ndarray, "N 2"], expected: Float64[np.ndarray, " N"]
+) -> tuple[tuple[int, int], float, float]:
+    """Where an image has the values that are expected at some of its pixels, and its correlation here and there."""
+    size = np.array(image.shape)
+    reach = np.minimum(round(_REACH * size.max()), size // 4)
+    # What is looked for is the middle of the image, which stays in it wherever it is tried.
+    row, column = pixels.T[::-1] - reach[:, None]
+    middle = size - 2 * reach
+    inside = (row >= 0) & (column >= 0) & (row < middle[0]) & (column < middle[1])
+    if inside.sum() < _FEW:
+        return (0, 0), 1.0, 1.0
+    mask, values = np.zeros((2, *middle), np.float32)
+    mask[row[inside], column[inside]] = 1
+    values[row[inside], column[inside]] = expected[inside]
+    values -= mask * (values.sum() / mask.sum())
+    # OpenCV's own normalized correlation with a mask is not exact at few pixels.
+    product, total, squares = (
+        cv2.matchTemplate(of, by, cv2.TM_CCORR).astype(np.float64)
+        for of, by in ((image, values), (image, mask), (image * image, mask))
+    )
+    variance = np.maximum(squares - total**2 / mask.sum(), 1e-4 * mask.sum())
+    correlation = product / np.sqrt(variance * max(float((values**2).sum()), 1e-12))
+    down, right = np.unravel_index(correlation.argmax(), correlation.shape) - reach
+    return (int(right), int(down)), float(correlation[tuple(reach)]), float(correlation.max())

@@ -1,0 +1,89 @@
+"""Photographs whose cameras are wrong: they show the building elsewhere than the others do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.occlusion import read_displaced
+from shellgs_method.occlusion.displaced import displacements
+from shellgs_method.occlusion.exposure import Exposed
+
+WIDTH, HEIGHT, FOCAL, WALL = 160, 120, 120.0, 4.0
+RNG = np.random.default_rng(0)
+WAVES = RNG.normal(0, 4, (24, 2)), RNG.uniform(0, 2 * np.pi, 24)
+ALL = np.ones(9, bool)
+
+
+def wall(x: float, right: int = 0, down: int = 0) -> Exposed:
+    """A view from x of a painted wall, and where it is, but by a photograph that is displaced by some pixels."""
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = -x
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    camera = Camera(viewmat, K, WIDTH, HEIGHT)
+    points = WALL * camera.rays().numpy()[..., :2] + [x, 0] - np.array([right, down]) * WALL / FOCAL
+    image = 0.5 + 0.08 * np.sin(points @ WAVES[0].T + WAVES[1]).sum(axis=-1)
+    return Exposed(camera, torch.from_numpy(image).float()[..., None].expand(-1, -1, 3), torch.full(image.shape, WALL))
+
+
+def row(*moved: tuple[int, int, int]) -> list[Exposed]:
+    """Views along the wall, some displaced."""
+    by = {k: (right, down) for k, right, down in moved}
+    return [wall(0.3 * k, *by.get(k, (0, 0))) for k in range(len(ALL))]
+
+
+@pytest.mark.parametrize("moved", [(0, 5, 0), (4, -12, 7), (8, 0, -6)])
+def test_a_displaced_photograph_is_found_with_its_displacement_and_no_other_is(moved: tuple[int, int, int]):
+    expected = np.zeros((len(ALL), 2))
+    expected[moved[0]] = np.array(moved[1:]) / WIDTH
+    np.testing.assert_allclose(displacements(row(moved), ALL), expected)
+
+
+def test_right_photographs_are_where_they_are_whatever_hides_the_wall_in_one():
+    views = row()
+    image = views[3].image.clone()
+    image[:, :90] = torch.from_numpy(RNG.uniform(0, 1, (HEIGHT, 90, 1))).float()
+    views[3] = views[3]._replace(image=image)
+    assert not displacements(views, ALL).any()
+
+
+def test_a_pixel_is_no_displacement():
+    assert not displacements(row((4, 1, 1)), ALL).any()
+
+
+def test_held_out_photographs_are_judged_and_tell_nothing_of_others():
+    training = ALL.copy()
+    training[[2, 3, 4, 5]] = False
+    found = displacements(row((2, 9, 0), (3, 9, 0), (4, 9, 0), (5, 9, 0)), training)
+    np.testing.assert_allclose(found[~training] * WIDTH, [[9, 0]] * 4)
+    assert not found[training].any()
+
+
+def test_what_too_little_is_known_of_is_not_displaced():
+    alone = [wall(0.0), wall(0.1, 20), wall(0.2)]  # two others at each point of the first and the last, one right
+    assert not displacements(alone[:2], ALL[:2]).any()
+    far = [view._replace(depth=torch.zeros(HEIGHT, WIDTH)) for view in row((4, 9, 0))]
+    assert not displacements(far, ALL).any()
+
+
+def test_a_plain_photograph_is_not_displaced():
+    views = row()
+    views[4] = views[4]._replace(image=torch.full((HEIGHT, WIDTH, 3), 0.5))
+    assert not displacements(views, ALL).any()
+
+
+def test_photographs_of_other_poses_are_told_until_they_are_left_out(shellgs, scene: Path):
+    assert "their own cameras put it" not in shellgs("cast", scene)
+    assert read_displaced(scene) == {}
+    first, other = sorted((scene / "images").iterdir())[3:6:2]
+    first.rename(kept := scene / "kept.png")
+    other.rename(first)
+    kept.rename(other)
+    for _ in range(2):
+        told = " ".join(shellgs("cast", scene).split())
+        assert set(read_displaced(scene)) == {f"images/{first.name}", f"images/{other.name}"}
+        assert "their own cameras put it: 2, images/" in told
