@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, read_json
+from shellgs_method.files.atomic import read_json, write_whole
 from shellgs_method.files.paths import is_hidden
 
 _RECORD = "record.json"
@@ -65,8 +65,7 @@ class Work:
         self._keys.pop(product, None)
         if key is not None:
             self._keys[product] = key
-        with atomic_write(self._file) as file:
-            file.write((json.dumps(self._keys, indent=1) + "\n").encode())
+        write_whole(self._file, json.dumps(self._keys, indent=1) + "\n")
 
 
 def refuse_foreign(folder: Path) -> None:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, write_whole
+from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
 from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View, load_mask, load_photograph
@@ -180,8 +180,7 @@ class _TrainingViews:
             for name, found in zip(missing, looks, strict=True):
                 content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)
-                with atomic_write(files[name]) as stream:
-                    stream.write(content.getvalue())
+                write_whole(files[name], content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
         colours = ColourModel(shell_views.values(), sweeps.values())
         return cls(shell_views, surface, light, sweeps, colours, _error(shell.manifest), windows)

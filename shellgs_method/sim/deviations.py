@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.evaluation.colours import deviation_colours
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass, classes_of
 from shellgs_method.geometry.triangles import Triangles
@@ -75,8 +75,7 @@ class Deviations:
             self.surface.vertices, self.surface.faces, face_colors=deviation_colours(self.distance, FULL), process=False
         )
         content = mesh.export(file_type="ply")
-        with atomic_write(path) as file:
-            file.write(content if isinstance(content, bytes) else str(content).encode())
+        write_whole(path, content if isinstance(content, bytes) else str(content))
 
 
 def find_deviations(

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import ConvexHull
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_write, write_whole
 from shellgs_method.sim.ground import Ground
 
 CELL = 0.2
@@ -171,8 +171,7 @@ class FreeSpace:
             "image: map.pgm", "mode: trinary", f"resolution: {self.cell}", f"origin: [{x:.3f}, {y:.3f}, 0.0]",
             "negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196", "",
         )  # fmt: skip
-        with atomic_write(folder / "map.yaml") as file:
-            file.write("\n".join(lines).encode())
+        write_whole(folder / "map.yaml", "\n".join(lines))
 
     def _cells(self, places: Float64[np.ndarray, "*P C"]) -> np.ndarray:
         """Row and column of the cells below places, those of the edge beyond it."""

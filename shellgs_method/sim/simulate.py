@@ -13,7 +13,7 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.files.atomic import atomic_contents, atomic_write, files_in, read_json
+from shellgs_method.files.atomic import atomic_contents, files_in, read_json, write_whole
 from shellgs_method.files.splats import write_splats
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -148,8 +148,7 @@ def _world(
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
     metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, ground, metrics)
-    with atomic_write(out / "metrics.json") as file:
-        file.write((json.dumps(metrics, indent=1) + "\n").encode())
+    write_whole(out / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     return metrics, chapters
 
 
@@ -168,7 +167,7 @@ def _building(
     folder.mkdir(parents=True, exist_ok=True)
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
-    fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
+    fused, seen = outward(Triangles(made.fused.vertices, made.fused.faces), eyes)
     ground = made.ground
     low = ground.at(fused.centres) + GROUND
     shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > low), np.zeros(len(seen), bool)
@@ -183,7 +182,7 @@ def _building(
     mesh = made.fused
     mesh.update_faces(~beside)
     mesh.remove_unreferenced_vertices()
-    fused, _ = outward(Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
+    fused, _ = outward(Triangles(mesh.vertices, mesh.faces), eyes)
     _report_gaps(collider, made.scene, log)
     leaking = leaks(collider.surface, shell or fused, eyes)
     _report_leaks(leaking, made, log)
@@ -204,8 +203,8 @@ def _building(
         tell("Looking for deviations from the shell")
         deviations = find_deviations(shell, fused, views, ahead, made.contradicted, **of)
         deviations.write(folder / "deviations.ply")
-        with atomic_write(folder / "deviations.json") as file:
-            file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
+        regions = [asdict(region) for region in deviations.regions]
+        write_whole(folder / "deviations.json", json.dumps(regions, indent=1) + "\n")
     tell("Measuring the collision geometry")
     surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
@@ -244,7 +243,7 @@ def _trusted(buildings: Sequence[Reconstruction]) -> Workspace:
     """The workspace where the splats of all buildings are to be believed."""
     cameras = [camera for made in buildings for camera in made.cameras]
     eyes, directions = positions(cameras), np.array([camera.viewmat[2, :3].double().numpy() for camera in cameras])
-    surfaces = [Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)) for made in buildings]
+    surfaces = [Triangles(made.fused.vertices, made.fused.faces) for made in buildings]
     distances = [np.linalg.norm(surface.closest(eyes).point - eyes, axis=1) for surface in surfaces]
     return Workspace.around(eyes, directions, np.min(distances, axis=0))
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.decimation import decimated
 from shellgs_method.geometry.spread import spread
-from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.triangles import Triangles, stacked
 from shellgs_method.sim.collision.clusters import ROUND, clusters, connected, flattest
 from shellgs_method.sim.collision.parts import Part, joined
 from shellgs_method.sim.ground import LEVEL, Ground
@@ -90,10 +90,11 @@ def make_collider(
     groups = connected(fused.faces, np.flatnonzero(standing))
     built = [np.empty(0, np.int64), *(group for group in groups if fused.areas[group].sum() >= SPECK)]
     built = Triangles(fused.vertices, fused.faces[np.concatenate(built)])
-    solid = built if shell is None else _together(shell, built)
-    surface = (
-        solid if shell is None or outside is None else _together(Triangles(shell.vertices, shell.faces[outside]), built)
-    )
+    solid = surface = built
+    if shell is not None:
+        seen = shell.faces if outside is None else shell.faces[outside]
+        more = built.vertices, built.faces
+        solid, surface = (Triangles(*stacked([(shell.vertices, faces), more])) for faces in (shell.faces, seen))
     most = int(np.ceil(density * surface.areas.sum() / 100))
     if not most:
         raise SceneError(
@@ -110,11 +111,6 @@ def make_collider(
         found = [np.flatnonzero(mine == number) for number in range(len(found))]
     parts = [_thickened(solid, surface, faces) for faces in found if len(faces)]
     return Collider(uncovered([part for part in parts if part is not None]), filled)
-
-
-def _together(one: Triangles, other: Triangles) -> Triangles:
-    vertices = np.concatenate([one.vertices, other.vertices])
-    return Triangles(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
 
 
 def _thickened(solid: Triangles, surface: Triangles, faces: Int64[np.ndarray, " _"]) -> Part | None:

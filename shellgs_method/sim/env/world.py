@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json
-from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.triangles import Triangles, stacked
 from shellgs_method.sim.env.robot import DEFAULT_ROBOT
 from shellgs_method.sim.frame import FRAME
 from shellgs_method.sim.free_space import FreeSpace
@@ -186,7 +186,5 @@ def _parts(model) -> list[Float64[np.ndarray, "V 3"]]:
 
 def _solid(ground: Ground, parts: Sequence[Float64[np.ndarray, "V 3"]]) -> Triangles:
     """The ground and the hulls of convex parts as one surface."""
-    faces = [ground.surface.faces, *(ConvexHull(part).simplices for part in parts)]
-    vertices = [ground.surface.vertices, *parts]
-    firsts = np.cumsum([0, *(len(each) for each in vertices[:-1])])
-    return Triangles(np.concatenate(vertices), np.concatenate([f + k for f, k in zip(faces, firsts, strict=True)]))
+    surface, hulls = ground.surface, ((part, ConvexHull(part).simplices) for part in parts)
+    return Triangles(*stacked([(surface.vertices, surface.faces), *hulls]))

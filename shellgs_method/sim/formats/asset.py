@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64, Int64
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.look.visual import visual_file
@@ -62,15 +62,13 @@ def write_parts(folder: Path, parts: Sequence[Part]) -> None:
 def write_obj(path: Path, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
     """Write a mesh as an obj without looks."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    with atomic_write(path) as file:
-        file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
+    write_whole(path, str(mesh.export(file_type="obj", include_normals=False, header=None)))
 
 
 def write_xml(path: Path, tree: ET.Element) -> None:
     """Write an indented XML file."""
     ET.indent(tree)
-    with atomic_write(path) as file:
-        file.write(b'<?xml version="1.0"?>\n' + ET.tostring(tree) + b"\n")
+    write_whole(path, b'<?xml version="1.0"?>\n' + ET.tostring(tree) + b"\n")
 
 
 def add(parent: ET.Element, tag: str, value: object = None, /, **attributes: object) -> ET.Element:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.geometry.decimation import decimated
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.formats.asset import write_obj
@@ -27,7 +27,7 @@ def write_ground(out: Path, ground: Ground) -> Triangles | None:
     if ground.is_level:
         return None
     surface = decimated(ground.surface, FACES)
-    with atomic_write(out / FIELD) as file:
-        file.write(np.array(ground.heights.shape, np.int32).tobytes() + ground.heights.astype(np.float32).tobytes())
+    shape, heights = np.array(ground.heights.shape, np.int32), ground.heights.astype(np.float32)
+    write_whole(out / FIELD, shape.tobytes() + heights.tobytes())
     write_obj(out / MESH, surface.vertices, surface.faces)
     return surface

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.frame import SimFrame
 from shellgs_method.sim.ground import Ground
@@ -113,5 +113,4 @@ def write_readme(out: Path, assets: Sequence[Asset], frame: SimFrame, ground: Gr
         first=assets[0].name,
         summary="\n".join(f"* {sentence}" for sentence in metrics["summary"]),
     )
-    with atomic_write(out / "README.md") as file:
-        file.write(text.encode())
+    write_whole(out / "README.md", text)

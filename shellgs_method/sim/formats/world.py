@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import write_whole
 from shellgs_method.sim.formats import mjcf, sdf, urdf
 from shellgs_method.sim.formats.asset import Asset, write_xml
 from shellgs_method.sim.formats.ground import write_ground
@@ -21,8 +21,7 @@ def write_asset(folder: Path, asset: Asset) -> None:
     write_xml(folder / "model.sdf", sdf.asset_sdf(asset))
     write_xml(folder / "model.config", sdf.manifest(asset))
     write_xml(folder / "package.xml", urdf.package(asset))
-    with atomic_write(folder / "CMakeLists.txt") as file:
-        file.write(urdf.cmake(asset).encode())
+    write_whole(folder / "CMakeLists.txt", urdf.cmake(asset))
 
 
 def write_world(out: Path, assets: Sequence[Asset], frame: SimFrame, ground: Ground = LEVEL) -> None:

@@ -13,7 +13,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from shellgs_method.errors import notice
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_write, write_whole
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.look.texture import TexturedMesh
 
@@ -51,17 +51,14 @@ def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " 
             f"visual.glb of {folder.name} has {len(content) / 1e6:.3g} MB, more than {megabytes:g}, with hardly any "
             "texture: give fewer --faces or more --megabytes."
         )
-    with atomic_write(folder / "visual.glb") as file:
-        file.write(content)
+    write_whole(folder / "visual.glb", content)
     with atomic_write(folder / TEXTURE) as file:
         mesh.image.save(file, "PNG")
-    with atomic_write(folder / "visual.mtl") as file:
-        file.write(f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n".encode())
+    write_whole(folder / "visual.mtl", f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n")
     for stale in folder.glob("visual*.obj"):
         stale.unlink()
     for each in map(SurfaceClass, np.unique(classes)):
-        with atomic_write(folder / visual_file(each)) as file:
-            file.write(_obj(mesh, mesh.faces[classes == each]).encode())
+        write_whole(folder / visual_file(each), _obj(mesh, mesh.faces[classes == each]))
     sizes = {"texture": list(mesh.image.size), "glb_texture": list(small)}
     return {"glb_bytes": len(content), **sizes, "triangles": len(mesh.faces)}
 
