@@ -260,7 +260,7 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
     from shellgs_method.registration.report import residual_table
 
     for sentence in placement.history:
-        console.print(sentence, highlight=False)
+        console.print(sentence)
     if placement.correspondences:
         head, *rows = residual_table(placement.correspondences)
         residuals = table(*head)
@@ -268,7 +268,7 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
             residuals.add_row(*row)
         console.print(residuals)
     for reason in validation.reasons:
-        console.print(f"{reason}.", style="yellow", highlight=False)
+        console.print(f"{reason}.", style="yellow")
     if validation.verdict == "refused":
         return
     report = scene / REPORT / "index.html"

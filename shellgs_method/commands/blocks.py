@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Optional
 
 from shellgs_method.blocks import WEAK
@@ -44,8 +45,6 @@ def blocks(
         again: Cut anew.
         paths: Paths of the scene's files.
     """
-    from dataclasses import replace
-
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
     from shellgs_method.blocks.cut import assigned, cut
     from shellgs_method.blocks.plan import draw
@@ -74,11 +73,11 @@ def blocks(
                     f"{file}: {cell.block.name} has {count} of the {WEAK} photographs that it needs: move its cuts, or "
                     "cut anew with --again"
                 )
-        console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.", highlight=False)
+        console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.")
     replace(found, cameras=BoundCameras.of(frames)).write(file)
     draw(file.with_suffix(".png"), found, seen, positions(view.camera for view in views))
     for cell in found.cells:
-        console.print(f"{cell.block.name}: {len(cell.block.photographs)} of {len(views)} photographs", highlight=False)
+        console.print(f"{cell.block.name}: {len(cell.block.photographs)} of {len(views)} photographs")
     if len(found.cells) == 1:
         console.print("The scene is one block: train it as it is, with ns-train.")
     elif sum(len(cell.block.photographs) for cell in found.cells) > SAME * len(views) * len(found.cells):
@@ -86,13 +85,11 @@ def blocks(
             f"Each block has about as many photographs as the whole scene, {len(views)}, so cuts save nothing: train "
             "the scene as it is, with ns-train."
         )
-    console.print(f"Written: {file}, {file.with_suffix('.png')}.", highlight=False)
+    console.print(f"Written: {file}, {file.with_suffix('.png')}.")
 
 
 def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     """What the photographs of a scene show of the shell, by its maps, or else of the SfM points."""
-    from dataclasses import replace
-
     from shellgs_method.blocks.cut import Sights, assumed_metres, sights, tracked
     from shellgs_method.files.cue_maps import CueMaps, find_cues
     from shellgs_method.files.sparse_points import find_sparse_points

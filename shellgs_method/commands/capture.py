@@ -36,11 +36,10 @@ def capture(
     total = len(summary.registered) + len(summary.missing)
     console.print(
         f"{len(summary.registered)} of {total} photographs registered; {summary.points} points, mean track length "
-        f"{summary.track_length:.1f}, mean reprojection error {summary.reprojection_error:.2f} px.",
-        highlight=False,
+        f"{summary.track_length:.1f}, mean reprojection error {summary.reprojection_error:.2f} px."
     )
     if summary.missing:
-        console.print(f"Not registered: {', '.join(summary.missing)}.", highlight=False)
+        console.print(f"Not registered: {', '.join(summary.missing)}.")
     if summary.reprojection_error > SUSPICIOUS_ERROR:
         console.print(
             f"More than {SUSPICIOUS_ERROR:g} px is a sign that identical windows were confused. Look at the "

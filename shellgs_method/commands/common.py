@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run
     from shellgs_method.export.frame import Frame
 
-# Without a terminal rich assumes 80 columns, which cut the tables of a log. Its markup would swallow a folder's [name].
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160, markup=False)
+# Without a terminal rich assumes 80 columns, which cut the tables of a log. Its markup would swallow a folder's [name],
+# and its colours would single out numbers in the midst of names and paths.
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160, markup=False, highlight=False)
 
 # tyro takes an empty list of files too, and its help would say (default: ).
 required = partial(tyro.conf.arg, help_behavior_hint="(required)")
@@ -63,7 +64,7 @@ def shell_words(metres_per_shell_unit: float, crs: str | None) -> list[str]:
 def open_page(path: Path) -> None:
     """Open an HTML file in the user's browser."""
     if not webbrowser.open(path.resolve().as_uri()):
-        console.print(f"No browser can be started here: open {path} in one.", highlight=False, soft_wrap=True)
+        console.print(f"No browser can be started here: open {path} in one.", soft_wrap=True)
 
 
 def place(frame: Frame) -> str:

@@ -54,7 +54,7 @@ def demo(
     scene = folder / "scene"
     _make(scene, FacadeConfig(width, height, views, seed))
     casting = ["shellgs", "cast", str(scene)]
-    console.print(f"$ {shlex.join(casting)}", style="bold", highlight=False)
+    console.print(f"$ {shlex.join(casting)}", style="bold")
     with Display(console) as display, display.work("scene") as tell, following(1) as pool:
         cast = pool.submit(follow, [casting], tell=tell)
         # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
@@ -67,7 +67,7 @@ def demo(
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     panel = scene / "cues" / "shell" / "panel.png"
-    console.print(f"To look at meanwhile: {panel}, the shell in the photographs.", highlight=False, soft_wrap=True)
+    console.print(f"To look at meanwhile: {panel}, the shell in the photographs.", soft_wrap=True)
     runs = grid([scene], METHODS, [0], iterations, folder)
     # On a CPU two runs at once are faster in total: much of each is single-threaded.
     jobs = 1 if torch.cuda.is_available() else 2
@@ -81,7 +81,6 @@ def demo(
         f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
         f"  3. {viewing}: walk around {runs[-1].variant.name} in a browser\n"
         f"The tables above are in {folder / 'results.md'}, a view's shell maps in {panel}.",
-        highlight=False,
         soft_wrap=True,
     )
     if open:
@@ -105,5 +104,5 @@ def _make(scene: Path, config: FacadeConfig) -> None:
             )
     else:
         size = f"{config.width} x {config.height}"
-        console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}", highlight=False)
+        console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}")
         write_scene(scene, config)

@@ -52,6 +52,6 @@ def elevation(
         facts[name] = {"upper_left": corner.tolist(), "right": right, "up": upwards, "out": out, "pixel": pixel}
         width, height = wall.size[:2]
         line = f"{output / name}.pdf: {width:.2f} x {height:.2f} m, {1000 * pixel:.3g} mm a pixel."
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     remove_earlier(output, facts)  # of a shell that was placed otherwise, say
     run.frame.describe(output / WALLS, facts)

@@ -41,7 +41,7 @@ def evaluate(
     rows = {"against the shell": metrics, "against the truth": truth} if truth else {"run": metrics}
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
         console.print(rich_table(rows, columns, console.width))
-    console.print(f"All metrics: {output_path}", highlight=False, soft_wrap=True)
+    console.print(f"All metrics: {output_path}", soft_wrap=True)
     if points:
         _print_surveyed(measured["surveyed"])
 

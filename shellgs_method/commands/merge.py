@@ -60,7 +60,7 @@ def report_seams(config: Path, coarse: Path) -> None:
     good = "good" if double["share"] <= DOUBLES else Text(f"more than {DOUBLES:.0%}", "bold")
     report.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(report)
-    console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)
+    console.print("What to do if more is lost: docs/street.md, Along the cuts.")
     if not seams:
         console.print("No held-out view shows the shell near a cut: the rest is not measured.")
-    console.print(f"{config}: the merged run. {path}: this report.", highlight=False, soft_wrap=True)
+    console.print(f"{config}: the merged run. {path}: this report.", soft_wrap=True)

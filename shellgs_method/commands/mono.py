@@ -50,7 +50,7 @@ def mono(
     if max_image_size is None and "shell" in find_cues(scene):
         max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
     licence = f", licence {predictor.licence}" if predictor.licence else ""
-    console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.", highlight=False)
+    console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.")
     if predictor.non_commercial:
         console.print("The licence of these weights forbids commercial use.", style="yellow")
     if points.observed is None:
@@ -64,6 +64,6 @@ def mono(
         f"{summary.residual:.1%} at the SfM points."
     )
     for name, problem in summary.problems.items():
-        console.print(f"No map for {name}: {problem}.", highlight=False)
+        console.print(f"No map for {name}: {problem}.")
     panel = save_panel(CueMaps.open(scene, "mono"), views)
     console.print(f"Look at {panel}: depth and normals must follow the photograph.")

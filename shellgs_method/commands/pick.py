@@ -72,7 +72,7 @@ def pick(
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
         tell("Preparing it to be drawn and picked")
         scan = Scan(shell, place)
-        console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
+        console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).")
         if open:
             webbrowser.open(server.url)
         with suppress(KeyboardInterrupt):
@@ -80,11 +80,11 @@ def pick(
     said = session.said()
     for point in said["points"]:
         if point["problem"] and not point["left_out"]:
-            console.print(f"{point['problem']}.", style="yellow", highlight=False, soft_wrap=True)
+            console.print(f"{point['problem']}.", style="yellow", soft_wrap=True)
     fit = said["fit"]
     if "problem" in fit:
-        console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
+        console.print(f"{picks}: {fit['problem']}. The same command goes on.", soft_wrap=True)
         return
     words = [scene, *shell, "--picks", picks, *shell_words(metres_per_shell_unit, crs)]
     align = f"shellgs align {shlex.join(map(str, words))}{paths.flags}"
-    console.print(f"{fit['words']}\nNext: {align}", highlight=False, soft_wrap=True)
+    console.print(f"{fit['words']}\nNext: {align}", soft_wrap=True)

@@ -180,14 +180,14 @@ def run(
             raise SceneError(f"another run of {scene} is going on: wait for it")
         if not steps.changed("all", *_state(recipe, scene, results)):
             (trained,) = (results / "runs").glob(f"*/*/{recipe.method}/*/config.yml")
-            console.print("Nothing is left to do.", highlight=False)
+            console.print("Nothing is left to do.")
         else:
             trained = _take(steps, recipe, scene, results, accept)
             steps.done("all", *_state(recipe, scene, results))
-    console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", highlight=False, soft_wrap=True)
+    console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", soft_wrap=True)
     page = trained.with_name("splats.html")
     viewer = f"ns-viewer --load-config {shlex.quote(str(trained))}"
-    console.print(f"Walk around: {page}, or {viewer}", highlight=False, soft_wrap=True)
+    console.print(f"Walk around: {page}, or {viewer}", soft_wrap=True)
 
 
 def _state(recipe: Recipe, scene: Path, results: Path) -> list[object]:
@@ -213,7 +213,7 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
         steps.done("capture", place)
         steps.done("capture beside", beside)
     else:  # captured with options of its own, perhaps
-        console.print(f"{scene} has cameras.", highlight=False)
+        console.print(f"{scene} has cameras.")
     steps.begin("the shell's place")
     _align(recipe, scene, tuple(shell), steps, accept)
     steps.begin("the shell in the photographs")
@@ -381,7 +381,7 @@ def _train(recipe: Recipe, scene: Path, results: Path, steps: _Steps) -> Run:
     except OtherSettingsError:
         aside = next(path for k in count(1) if not (path := results / f"runs-{k}").exists())
         (results / "runs").rename(aside)
-        console.print(f"What was trained with other settings or maps is now in {aside}.", highlight=False)
+        console.print(f"What was trained with other settings or maps is now in {aside}.")
     except DamagedRunError:  # which is told below
         pass
     truth = scene / "cues/truth/manifest.json"

@@ -36,12 +36,9 @@ def sim(
     tell("Importing what simulates")
     from shellgs_method.sim.simulate import simulate
 
-    def report(sentence: str) -> None:
-        console.print(sentence, highlight=False)
-
-    metrics, _ = simulate(configs, out, settings, report)
+    metrics, _ = simulate(configs, out, settings, console.print)
     for sentence in metrics["summary"]:
-        report(sentence)
+        console.print(sentence)
     console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how accurate it is.")
 
 

@@ -76,7 +76,7 @@ def splats(
         loss = whole - psnr_of(run, level.splats, frame) if count < all_of_them else 0.0
         frame.describe(Path(f"{path}.json"), {"splats": count, "psnr_loss": round(loss, 3), **facts})
         taken = path.stat().st_size / 1e6
-        console.print(f"{path}: {count} Gaussians, {taken:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
+        console.print(f"{path}: {count} Gaussians, {taken:.1f} MB, {loss:.2f} dB of PSNR lost.")
     console.print(where)
     _tell_of_others(output, levels)
 
@@ -85,4 +85,4 @@ def _tell_of_others(output: Path, levels: int) -> None:
     """Tell of files that are named as further levels: an earlier command's, or the user's, so they are kept."""
     further = (output.with_stem(f"{output.stem}-{number}") for number in range(levels, MOST_LEVELS))
     if others := ", ".join(path.name for path in further if path.exists()):
-        console.print(f"Not of these levels, and left as before: {others}.", style="yellow", highlight=False)
+        console.print(f"Not of these levels, and left as before: {others}.", style="yellow")

@@ -69,7 +69,7 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
         run.settle()
         _remove_damaged(run, console)
     unfinished = [run for run in usable if not run.finished]
-    console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are already finished.", highlight=False)
+    console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are already finished.")
     if unfinished:
         failures |= launch(unfinished)
     for run in usable:  # the launch may have written damaged files too
@@ -84,7 +84,7 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
     for run, why in failures.items():
         where = f" All of its output is in {run.folder / 'log.txt'}."
         console.print(Text.assemble((f"{run.label} failed.", "red"), where))
-        console.print(why, markup=False, highlight=False)
+        console.print(why, markup=False)
     return comparison
 
 
@@ -92,13 +92,13 @@ def _remove_damaged(run: Run, console: Console) -> None:
     """Remove unreadable metrics and renders, so that they are made again."""
     for half in (None, *run.halves):
         if (path := run.metrics(half)).exists() and read_metrics(path) is None:
-            console.print(f"{path} is damaged: measuring it again.", style="yellow", highlight=False)
+            console.print(f"{path} is damaged: measuring it again.", style="yellow")
             path.unlink()
     for path in run.renders.glob("*.npz"):
         try:
             Snapshot.load(path)
         except SceneError as error:
-            console.print(f"{error}: rendering it again.", style="yellow", highlight=False)
+            console.print(f"{error}: rendering it again.", style="yellow")
             path.unlink()
             run.metrics().unlink(missing_ok=True)
 

@@ -81,7 +81,7 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
                 f"a run takes {lacking}, which this machine has not: give less, or the --address of a cluster"
             )
         if lacking:
-            console.print(f"No node has {lacking} now: runs wait until one joins the cluster.", highlight=False)
+            console.print(f"No node has {lacking} now: runs wait until one joins the cluster.")
         task = ray.remote(max_retries=RETRIES, **takes.options)(_finish_on_node)
         # On any node, which may be lost.
         stages = Queue(actor_options={"num_cpus": 0, "max_restarts": -1})
@@ -199,7 +199,7 @@ class _Tasks:
         if error is not None:
             self.failures[run] = error
         left = len(self.pending) + len(self.waiting)
-        self.console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
+        self.console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.")
 
 
 @contextmanager

@@ -99,7 +99,7 @@ class Display:
         while not self._ended.wait(TICK):
             for work, _ in [*self._works.values()]:
                 if sentence := work.for_log():
-                    self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+                    self._console.print(sentence, markup=False, soft_wrap=True)
 
 
 def _clock_time(seconds: float) -> str:

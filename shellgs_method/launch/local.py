@@ -44,7 +44,7 @@ def launch_locally(runs: Iterable[JobT], jobs: int, console: Console) -> dict[Jo
                 failures[run], outcome = str(error), "failed"
             else:
                 future.result()
-            console.print(f"{run.label} {outcome}, {done} of {len(runs)}.", highlight=False)
+            console.print(f"{run.label} {outcome}, {done} of {len(runs)}.")
     return {run: failures[run] for run in runs if run in failures}
 
 
@@ -160,7 +160,7 @@ def _finish_visibly(run: Job, console: Console, display: Display, devices: Simpl
     device = devices.get()
 
     def announce(command: Sequence[str]) -> None:
-        console.print(f"$ {shlex.join(command)}", style="bold", highlight=False, soft_wrap=True)
+        console.print(f"$ {shlex.join(command)}", style="bold", soft_wrap=True)
 
     try:
         with display.work(run.label) as tell:

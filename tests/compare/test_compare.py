@@ -302,7 +302,7 @@ def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
 @pytest.mark.parametrize("terminal", [False, True])
 def test_the_console_shows_that_results_are_written(pristine_scene, tmp_path, terminal):
     output = io.StringIO()
-    console = Console(file=output, force_terminal=terminal)
+    console = Console(file=output, force_terminal=terminal, highlight=False)
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     compare(runs, partial(launch_locally, jobs=1, console=console), tmp_path / "out", console)
     assert WRITING in output.getvalue()
@@ -315,7 +315,7 @@ def test_the_console_shows_what_runs_are_doing_and_how_they_ended(pristine_scene
     monkeypatch.setattr(display, "TICK", 0.05)
     monkeypatch.setenv("FAKE_SECONDS", "0.5")
     output = io.StringIO()
-    console = Console(file=output, force_terminal=terminal, width=160)
+    console = Console(file=output, force_terminal=terminal, width=160, highlight=False)
     launch_locally(fake_grid([pristine_scene], ["shellgs", "mono-gs"], tmp_path), 1, console)
     assert "iteration 12 of 20 (0:0" in output.getvalue()
     assert "scene/shellgs/seed-0 finished, 1 of 2." in output.getvalue()
