@@ -257,11 +257,11 @@ class _Capture:
                 "finding features",
                 len(self.names),
                 partial(rows, "descriptors"),
-                database=str(database),
-                photographs=str(self.folder),
+                database=database,
+                photographs=self.folder,
                 lenses=[asdict(lens) for lens in lenses],
                 rigs=[face_rig()] if faces else [],
-                masks=str(self.work.folder / "masks") if self.masked else None,
+                masks=self.work.folder / "masks" if self.masked else None,
                 sift=_SIFT[self.config.quality],
                 contrasts={name: contrast(self.folder / name) for name in self.names},
                 camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
@@ -321,22 +321,21 @@ class _Capture:
         models, pairs = found["models"], found.get("pairs", pairs)
         if not models:
             return [], models
-        bridges = self._step("find_bridges", "looking for bridges", 1, None, models=str(coarse))
+        bridges = self._step("find_bridges", "looking for bridges", models=coarse)
         if not self.work.has("joined", self.model_key):
             if bridges:
                 self._match(database, pairs + bridges, "matching groups of photographs")
             with self.work.making("joined", self.model_key) as folder:
-                where = {"database": str(database), "models": str(coarse), "output": str(folder)}
-                apart = self._step("join", "joining groups of photographs", 1, None, **where)
+                where: dict[str, Any] = {"database": database, "models": coarse, "output": folder}
+                apart = self._step("join", "joining groups of photographs", **where)
                 (folder / "apart.json").write_text(json.dumps({"models": apart}))
         apart = read_json(joined / "apart.json")["models"]
-        where = {"models": str(joined), "matched": pairs + bridges, "each": self.config.overlap}
-        loops = self._step("find_loops", "looking for loops", 1, None, **where)
+        where: dict[str, Any] = {"models": joined, "matched": pairs + bridges, "each": self.config.overlap}
+        loops = self._step("find_loops", "looking for loops", **where)
         if not bridges and not loops:
             return apart, models
         self._match(database, pairs + bridges + loops, "matching loops")
-        where = {"database": str(database), "models": str(joined), "trusted": pairs}
-        kept = self._step("settle", "checking loops", 1, None, **where)
+        kept = self._step("settle", "checking loops", database=database, models=joined, trusted=pairs)
         return apart, None if kept else models
 
     def _astray(self, database: Path) -> list[Pair]:
@@ -344,17 +343,17 @@ class _Capture:
         if self.rig or any(map(is_face, self.names)):
             return []
         order = [list(names) for _, names in groupby(self.names, key=lambda name: name.rpartition("/")[0])]
-        return self._step("follow", "following the walk", 1, None, database=str(database), passes=order)
+        return self._step("follow", "following the walk", database=database, passes=order)
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
         with _counting(database) as rows:
             done = partial(rows, "two_view_geometries")
-            self._step("match", description, len(pairs), done, database=str(database), pairs=pairs)
+            self._step("match", description, len(pairs), done, database=database, pairs=pairs)
 
     def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
-        arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
+        where: dict[str, Any] = {"database": database, "photographs": self.folder, "output": folder}
         has_parallax = _flat_pairs(database) <= _NO_PARALLAX
-        return self._step("reconstruct", description, len(self.names), None, **arguments, has_parallax=has_parallax)
+        return self._step("reconstruct", description, len(self.names), **where, has_parallax=has_parallax)
 
     def _mounted(self, database: Path, folder: Path) -> list[dict[str, Any]]:
         """Find the cameras of a rig again, together, from those in a folder, which they replace.
@@ -366,8 +365,8 @@ class _Capture:
             copy = copied / database.name  # a resumed capture begins without the rig
             with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
                 source.backup(target)
-            where = {"database": str(copy), "photographs": str(self.folder), "model": str(folder)}
-            found = self._step("mount", "finding the rig", len(self.names), None, prefixes=self.rig, **where)
+            where: dict[str, Any] = {"database": copy, "photographs": self.folder, "model": folder}
+            found = self._step("mount", "finding the rig", len(self.names), prefixes=self.rig, **where)
         self.work.drop("rig")
         if "loose" in found:
             prefix, turned, moved = found["loose"]
@@ -379,7 +378,7 @@ class _Capture:
         return found["models"]
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
-        """Summary of the largest model.
+        """Summary of the largest model, of which what makes it doubtful is told.
 
         Raises:
             SceneError: it has too few of the photographs, or they show too few points.
@@ -387,7 +386,18 @@ class _Capture:
         names, models = found["photographs"], found["models"]
         largest: dict[str, Any] = models[0] if models else {"names": []}
         missing = sorted(set(names) - set(largest["names"]), key=along_the_walk)
-        registered = len(largest["names"])
+        self._refuse_little(found, largest, missing)
+        self._tell_of_doubts(largest)
+        for model in models[1:]:
+            if len(model["names"]) >= LEAST_REGISTERED:
+                only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
+                self._tell_of_a_pass_apart(only, found.get("apart", []))
+        kept = ("points", "reprojection_error", "track_length")
+        return Summary(largest["names"], missing, **{name: largest[name] for name in kept})
+
+    def _refuse_little(self, found: dict[str, Any], largest: dict[str, Any], missing: list[str]) -> None:
+        """Refuse a model of too few of the photographs, or of too few points; tell of photographs without parallax."""
+        names, models, registered = found["photographs"], found["models"], len(largest["names"])
         is_flat = found.get("flat_pairs", 0) > _NO_PARALLAX
         points, seen_in = largest.get("points", 0), largest.get("track_length", 0.0)
         sees_little = points * seen_in < LEAST_SEEN * registered
@@ -421,15 +431,17 @@ class _Capture:
                 f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, "
                 f"which show at least {LEAST_SEEN} points each"
             )
-        if torn := largest.pop("torn", None):
+
+    def _tell_of_doubts(self, largest: dict[str, Any]) -> None:
+        """Tell of a model that is torn, or whose focal length changes or is not that of its lens."""
+        if torn := largest.get("torn"):
             slower = "more --frames, or a slower walk, help" if self.is_video else "more photographs there help"
             notice(
                 f"The cameras found for {self.source} contradict nearly all that {' and '.join(torn)} and their "
                 f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
                 f"{slower}."
             )
-        lenses = largest.pop("lenses", [])
-        if zoomed := largest.pop("zoomed", None):
+        if zoomed := largest.get("zoomed"):
             change, short, long, behind = zoomed
             step = f" (in a step: {behind} is the first behind it)" if behind else ""
             notice(
@@ -439,13 +451,8 @@ class _Capture:
                 "these; photographs of two lenses go into a folder each, with --cameras folder."
             )
         else:
-            for lens in lenses:
+            for lens in largest.get("lenses", []):
                 _tell_of_a_doubtful_lens(**lens)
-        for model in models[1:]:
-            if len(model["names"]) >= LEAST_REGISTERED:
-                only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
-                self._tell_of_a_pass_apart(only, found.get("apart", []))
-        return Summary(missing=missing, registered=largest.pop("names"), **largest)
 
     def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
         if not names:
@@ -479,10 +486,10 @@ class _Capture:
                 "undistorting",
                 len(summary.registered),
                 lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
-                model=str(self.work.folder / "model"),
-                photographs=str(self.folder),
-                masks=str(self.work.folder / "masks") if self.masked else None,
-                output=str(folder),
+                model=self.work.folder / "model",
+                photographs=self.folder,
+                masks=self.work.folder / "masks" if self.masked else None,
+                output=folder,
             )
             for name in _files(folder / "images"):
                 keep_exposure(self.folder / name, folder / "images" / name)
@@ -496,11 +503,13 @@ class _Capture:
             if part.exists() and not (self.scene / name).exists():
                 os.replace(part, self.scene / name)
 
-    def _step(self, step: str, description: str, total: int, count: Callable[[], int] | None, **arguments: Any) -> Any:
-        log = self.work.folder / "colmap.log"
-        return run_step(
-            step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
-        )
+    def _step(
+        self, step: str, description: str, total: int = 1, count: Callable[[], int] | None = None, **arguments: Any
+    ) -> Any:
+        """Run a step in its own process; a step's paths are given as they are."""
+        arguments = {name: str(given) if isinstance(given, Path) else given for name, given in arguments.items()}
+        shown: dict[str, Any] = {"progress": self.progress, "description": description, "total": total, "count": count}
+        return run_step(step, arguments, log=self.work.folder / "colmap.log", **shown)
 
 
 def _tell_of_a_doubtful_lens(names: list[str], focal: Sequence[float], exif: float | None) -> None:
