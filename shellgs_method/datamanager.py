@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -48,7 +47,6 @@ from shellgs_method.occlusion.exposure import (
 from shellgs_method.runs.host import NoPixelSampler
 
 ViewT = TypeVar("ViewT", SeededView, SkyView)
-logger = logging.getLogger(__name__)
 # Nerfstudio's own says nothing in a log.
 full_images_datamanager.track = track  # pyright: ignore[reportPrivateImportUsage]
 
@@ -120,7 +118,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                 for view in views:
                     maps.check(view.name, view.camera, any_size=True)
         except SceneError as error:
-            logger.warning("No metrics against the %s maps in this run: %s.", kind, error)
+            notice(f"No metrics against the {kind} maps in this run: {error}.")
             return False
         return True
 
@@ -145,13 +143,9 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                     f"{maps.folder} has a manifest: run `{command}` to make them again"
                 )
             if missing:
-                logger.warning(
-                    "%d of the %d training views have no %s map, or an empty one, and train with their photograph "
-                    "alone; `%s` makes maps.",
-                    missing,
-                    len(dataset),
-                    kind,
-                    command,
+                notice(
+                    f"{missing} of the {len(dataset)} training views have no {kind} map, or an empty one, and train "
+                    f"with their photograph alone; `{command}` makes maps."
                 )
         self._tell_of_other_photographs()
         held_out = self.eval_dataset

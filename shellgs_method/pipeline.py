@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +17,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch import Tensor
 
 from shellgs_method.datamanager import FacadeDataManager
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -40,8 +39,6 @@ from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_lo
 from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.host import mend_commands
 from shellgs_method.viewer import ContradictedShell
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -90,13 +87,10 @@ class FacadePipeline(VanillaPipeline):
         """Start from what the photographs say of their exposures, and from seeds at the mean exposure."""
         data, gains = self.datamanager, None
         if self.model.config.trust == "photographs" and (names := data.train_dataset.uncompared()):
-            logger.warning(
-                "%d of the %d training views were not compared with the others, such as %s: the shell counts there, "
-                "whatever they show, and trees before it cost image quality; run `%s`.",
-                len(names),
-                len(data.train_dataset),
-                names[0],
-                data.train_dataset.cues["shell"].command,
+            notice(
+                f"{len(names)} of the {len(data.train_dataset)} training views were not compared with the others, such "
+                f"as {names[0]}: the shell counts there, whatever they show, and trees before it cost image quality; "
+                f"run `{data.train_dataset.cues['shell'].command}`."
             )
         if self.model.config.coarse is not None:
             self._start_in_block(self.model.config.coarse)

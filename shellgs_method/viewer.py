@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,12 @@ from jaxtyping import Float64
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
+from shellgs_method.errors import notice
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.occlusion import CONTRADICTED_PLACES
 
 POINT = 0.004
 """Point size relative to the cloud's longest side."""
-
-logger = logging.getLogger(__name__)
 
 
 class ContradictedShell(ViewerControl):
@@ -43,7 +41,7 @@ class ContradictedShell(ViewerControl):
             points = transformed(np.asarray(cloud.vertices), self._from_scene) * VISER_NERFSTUDIO_SCALE_RATIO
             colours = np.asarray(cloud.colors)[:, :3]
         except Exception as error:
-            logger.warning("%s is not shown: it cannot be read (%s).", self._file, error)
+            notice(f"{self._file} is not shown: it cannot be read ({error}).")
             return
         size = POINT * float(np.ptp(points, axis=0).max())
         viewer.viser_server.scene.add_point_cloud(self.LAYER, points, colours, point_size=size, visible=False)

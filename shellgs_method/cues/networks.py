@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.machine.extras import import_extra
 
 if TYPE_CHECKING:
@@ -168,7 +167,7 @@ def _licence(folder: Path) -> str:
     try:
         data = ModelCard.load(folder / "README.md").data
     except ValueError as error:
-        logging.getLogger(__name__).warning("the model card in %s cannot be read: %s", folder, error)
+        notice(f"the model card in {folder} cannot be read: {error}")
         return unknown
     name = data.get("license_name") if data.get("license") == "other" else data.get("license")
     return str(name or unknown).lower()

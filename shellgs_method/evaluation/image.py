@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import urllib.request
@@ -16,6 +15,7 @@ from jaxtyping import Bool, Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
+from shellgs_method.errors import notice
 from shellgs_method.machine.doctor import lpips_weights
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ SMALLEST_LPIPS_IMAGE = 31
 
 CLIPPED = 0.5 / 255
 """Distance from black or white within which a colour is clipped."""
-
-logger = logging.getLogger(__name__)
 
 
 def image_errors(
@@ -119,7 +117,7 @@ def lpips_network() -> Metric | str:
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
         except Exception as error:  # incomplete download, damaged file, full disk: continue without LPIPS
             obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
-    logger.warning("LPIPS is not available: %s.", obstacle)
+    notice(f"LPIPS is not available: {obstacle}.")
     return obstacle
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -27,8 +26,6 @@ from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.clouds import VERSION
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
-
-log = logging.getLogger(__name__)
 
 ALIGNMENTS = {"shell": ALIGNMENT, "truth": TRUTH}
 """Files of the alignments of what is cast, in the scene's folder, by the kinds of the maps."""
@@ -90,10 +87,9 @@ class PlacedShell:
         refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
         step = mesh.step.scaled(alignment.metres_per_shell_unit)
         if step.coarsest > FINE:
-            log.warning(
-                "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
-                alignment.named,
-                step.in_words(),
+            notice(
+                f"the coordinates of {alignment.named} are stored in steps of {step.in_words()}: the maps are up to "
+                "half of that off"
             )
         caster = ShellCaster(mesh, alignment.shell_to_scene)
         _check_placement(caster, cameras, alignment.named)
@@ -296,13 +292,10 @@ def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: str)
             "shell's units"
         )
     if span > 0 and (caster.extent < span / 100 or not span / 100 < depth < span * 100):
-        log.warning(
-            "the shell %s is %.3g scene units wide and %.3g away, the cameras span %.3g: check the alignment's scale "
-            "and the shell's units (millimetres taken for metres are 1000 times off)",
-            shell,
-            caster.extent,
-            depth,
-            span,
+        notice(
+            f"the shell {shell} is {caster.extent:.3g} scene units wide and {depth:.3g} away, the cameras span "
+            f"{span:.3g}: check the alignment's scale and the shell's units (millimetres taken for metres are 1000 "
+            "times off)"
         )
 
 
