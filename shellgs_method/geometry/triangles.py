@@ -137,6 +137,17 @@ def stacked(
     return np.concatenate(vertices), np.concatenate([each + start for each, start in zip(faces, starts, strict=True)])
 
 
+def referenced(
+    vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> tuple[Float64[np.ndarray, "W 3"], Int[np.ndarray, "F 3"]]:
+    """A mesh without the vertices of no triangle; as it is if it has no triangles, or indices that are out of range."""
+    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        return vertices, faces
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
 def area_vectors(vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float64[np.ndarray, "F 3"]:
     """Normals of triangles, by their winding, with the triangles' areas as lengths."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))

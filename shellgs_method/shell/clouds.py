@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,14 +10,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import Delaunay, QhullError
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.clouds import VoxelCloud
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.planes import largest_plane
-from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.triangles import Triangles, referenced, stacked
 from shellgs_method.machine.open3d import import_open3d, reason
-
-log = logging.getLogger(__name__)
 
 Mesher = Literal["planes", "bpa", "poisson"]
 
@@ -97,8 +94,8 @@ def mesh_cloud(
         SceneError: the points make no surface.
     """
     if cloud.dropped:
-        what = "that are NaN or infinite, or absurdly far away"
-        log.warning("dropped %d of %d points %s", cloud.dropped, cloud.total + cloud.dropped, what)
+        of = f"{cloud.dropped} of {cloud.total + cloud.dropped}"
+        notice(f"dropped {of} points that are NaN or infinite, or absurdly far away")
     if cloud.total == 0:
         raise SceneError("all points are NaN or infinite" if cloud.dropped else "the point cloud has no points")
     origin = np.median(cloud.points, axis=0)  # squares of georeferenced coordinates would lose precision
@@ -107,9 +104,10 @@ def mesh_cloud(
         parts = list(_MESHERS[mesher](points))
     except RuntimeError as error:  # raised by Open3D, for too few points for example
         raise SceneError(f"the points make no surface with the mesher {mesher!r} ({reason(error)})") from error
-    vertices, faces = _merge(parts)
-    if len(faces) == 0:
+    parts = [part for part in parts if len(part.faces)]
+    if not parts:
         raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")
+    vertices, faces = stacked(referenced(part.vertices, part.faces) for part in parts)
     distance = Triangles(vertices, faces).distance(cloud.sample - origin)
     report = Meshing(
         mesher=mesher,
@@ -225,10 +223,6 @@ def _balls(points: np.ndarray, normals: np.ndarray, spacing: float) -> _Part:
     return _Part(np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64))
 
 
-def _ball_pivoting(cloud: _Points) -> Iterator[_Part]:
-    yield _balls(cloud.points, cloud.normals, cloud.spacing)
-
-
 def _poisson(cloud: _Points) -> Iterator[_Part]:
     """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), trimmed by distance: density would fill windows."""
     cells = np.ptp(cloud.points, axis=0).max() / (2 * cloud.spacing)
@@ -241,22 +235,11 @@ def _poisson(cloud: _Points) -> Iterator[_Part]:
     yield _Part(vertices, faces[near[faces].all(axis=1)])
 
 
-_MESHERS: dict[Mesher, Callable[[_Points], Iterator[_Part]]] = {
+_MESHERS: dict[Mesher, Callable[[_Points], Iterable[_Part]]] = {
     "planes": _planes,
-    "bpa": _ball_pivoting,
+    "bpa": lambda cloud: [_balls(cloud.points, cloud.normals, cloud.spacing)],
     "poisson": _poisson,
 }
-
-
-def _merge(parts: list[_Part]) -> tuple[np.ndarray, np.ndarray]:
-    """Join the parts in one mesh, without unused vertices."""
-    vertices, faces, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for part in parts:
-        used, renumbered = np.unique(part.faces, return_inverse=True)
-        vertices.append(part.vertices[used])
-        faces.append(renumbered.reshape(-1, 3) + count)
-        count += len(used)
-    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def _legacy(points: np.ndarray, normals: np.ndarray | None = None):

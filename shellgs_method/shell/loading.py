@@ -22,6 +22,7 @@ from shellgs_method.files.surfaces import read_geometry, read_surface
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
+from shellgs_method.geometry.triangles import referenced
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, joined, without_area
 from shellgs_method.shell.spacing import Sights, as_seen
@@ -114,9 +115,9 @@ def _load_file(
     surface = surface or read_surface(path)
     try:
         if isinstance(surface, Geometry):
-            used = _referenced(surface.vertices, surface.faces)
+            used = referenced(surface.vertices, surface.faces)
             usable = _without_outliers(*used, path)
-            near = _referenced(used[0], used[1][usable])
+            near = referenced(used[0], used[1][usable])
             mesh = ShellMesh(*near, classes=surface.classes[usable])
             refuse_degrees(mesh.vertices, path)
             step = NO_STEP if surface.drawn else mesh_step(mesh.vertices, mesh.faces)
@@ -204,15 +205,6 @@ def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> Bo
     return usable
 
 
-def _referenced(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop vertices of no triangle; indices that are out of range are left for :class:`ShellMesh` to refuse."""
-    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-        return vertices, faces
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    return vertices[used], (np.cumsum(used) - 1)[faces]
-
-
 def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
     """Drop triangles without area; those of a file are counted, those that a mesher leaves are nobody's loss."""
     flat = without_area(mesh.vertices, mesh.faces)
@@ -220,5 +212,5 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
         return mesh
     if path is not None:
         notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
-    vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
+    vertices, faces = referenced(mesh.vertices, mesh.faces[~flat])
     return replace(mesh, vertices=vertices, faces=faces, classes=mesh.classes[~flat], source=mesh.source[~flat])
