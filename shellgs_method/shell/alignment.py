@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -239,30 +239,8 @@ class Alignment:
             )
         try:
             fields = read_json(path)
-            matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
-            unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
-            verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
-            known = dict(fields.get("metrics", {}))
-            metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
-            cameras = BoundCameras.from_json(fields.get("cameras", {}))
-            model = str(fields.get("model", ""))
-            spacing = None if fields.get("spacing") is None else float(fields["spacing"])
-            up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)
-            return cls(
-                matrix,
-                _strings(fields["shell"]),
-                float(unit),
-                str(source),
-                verdict,
-                metrics,
-                mesher,
-                cameras,
-                model,
-                spacing,
-                up,
-                str(fields.get("crs", "")),
-                tuple(map(str.lower, _strings(fields.get("hashes", ())))),
-            )
+            matrix, shells = np.array(fields["shell_to_scene"], dtype=np.float64), _strings(fields["shell"])
+            return cls(matrix, shells, **{name: read(fields[name]) for name, read in _READ.items() if name in fields})
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except SceneError as error:
@@ -316,6 +294,25 @@ class Alignment:
 def _strings(value: str | Sequence[object]) -> tuple[str, ...]:
     return (value,) if isinstance(value, str) else tuple(map(str, value))
 
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+_READ: dict[str, Callable[[Any], Any]] = {
+    "metres_per_shell_unit": float,
+    "source": str,
+    "verdict": str,
+    "metrics": lambda metrics: {str(name): _number(value) for name, value in dict(metrics).items()},
+    "mesher": lambda mesher: mesher,
+    "cameras": BoundCameras.from_json,
+    "model": str,
+    "spacing": _number,
+    "up": lambda up: None if up is None else np.array(up, dtype=np.float64),
+    "crs": str,
+    "hashes": lambda hashes: tuple(map(str.lower, _strings(hashes))),
+}
+"""What files may say besides the matrix and the shell, which older ones do not say all of."""
 
 _AROUND_NUMBERS = re.compile(r"\[\d+:\d+:\d+\]|#.*|[\[\](),;]")
 """What programs write beside the numbers of a matrix: the times of CloudCompare's console, comments, brackets."""
