@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ from typing import Any
 from dataparsers.facade import trainable_cells
 from shellgs_method.compare.runs import Run, Variant, recorded_settings
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_contents, content_hash
+from shellgs_method.files.atomic import atomic_contents, content_hash, link_or_copy
 from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.files.cue_maps import find_cues, map_path
 from shellgs_method.files.scene import ScenePaths
@@ -86,7 +85,7 @@ class BlockJob(Run):
             for name in ("config.yml", "dataparser_transforms.json"):
                 shutil.copyfile(self.coarse / name, folder / name)
             (folder / "nerfstudio_models").mkdir()
-            _link(checkpoint, folder / "nerfstudio_models" / checkpoint.name)
+            link_or_copy(checkpoint, folder / "nerfstudio_models" / checkpoint.name)
 
 
 @dataclass(frozen=True)
@@ -216,11 +215,3 @@ def _refuse_own(variant: Variant) -> None:
     }
     if name := next((name for name, there in own.items() if there), None):
         raise SceneError(f"{variant.name} sets {name}, which `shellgs street` sets for each run: leave it out")
-
-
-def _link(file: Path, to: Path) -> None:
-    """A hard link where the file system has them, else a copy."""
-    try:
-        os.link(file, to)
-    except OSError:
-        shutil.copyfile(file, to)

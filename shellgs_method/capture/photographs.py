@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import filecmp
-import os
-import shutil
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,7 +18,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.capture.config import Cameras
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import link_or_copy, write_whole
 from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.paths import (
     CAPTURED,
@@ -218,11 +216,8 @@ def add_photograph(source: Path, target: Path) -> None:
     if not is_usable:
         upright = ImageOps.exif_transpose(without_hidden(image)).convert("RGB")
         upright.save(target, wanted, quality=95, subsampling=0, exif=exif_of(upright))
-        return
-    try:
-        os.link(source.resolve(), target)
-    except OSError:  # another file system
-        shutil.copyfile(source, target)
+    else:
+        link_or_copy(source.resolve(), target)
 
 
 def keep_exposure(source: Path, undistorted: Path) -> None:
@@ -239,8 +234,7 @@ def keep_exposure(source: Path, undistorted: Path) -> None:
         exif, is_jpeg = exif_of(image), image.format == "JPEG"
     exif.get_ifd(ExifTags.IFD.Exif).update(exposure)
     content, segment = undistorted.read_bytes(), exif.tobytes()
-    with atomic_write(undistorted) as file:
-        file.write(_jpeg_with_exif(content, segment) if is_jpeg else _png_with_exif(content, segment))
+    write_whole(undistorted, _jpeg_with_exif(content, segment) if is_jpeg else _png_with_exif(content, segment))
 
 
 def _jpeg_with_exif(content: bytes, exif: bytes) -> bytes:

@@ -60,6 +60,14 @@ def unfinished(path: Path, suffix: str = "") -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp{suffix}")
 
 
+def link_or_copy(file: Path, to: Path) -> None:
+    """Make a hard link to a file where the file system has them, else a copy."""
+    try:
+        os.link(file, to)
+    except OSError:
+        shutil.copyfile(file, to)
+
+
 def replace_folder(folder: Path, fresh: Path) -> None:
     """Replace a folder by another; the old one is removed last, see :func:`recover_folder`."""
     old = _old(folder)
