@@ -18,7 +18,7 @@ from dataparsers.facade import read_views
 from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.holdout import Half
-from shellgs_method.files.atomic import fingerprint, recover_folder, write_whole
+from shellgs_method.files.atomic import fingerprint, read_json, recover_folder, write_whole
 from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
 from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
@@ -74,7 +74,7 @@ class Variant:
                 f"there is no method {method!r}: use {ours}, another that ns-train lists, or NAME=METHOD FLAGS"
             )
         variant = cls(name, method, tuple(flags))
-        if name in {*all_methods, *ABLATIONS} and variant != cls(name, *_definition(name)):
+        if words and name in {*all_methods, *ABLATIONS} and variant != cls.parse(name):
             raise SceneError(f"{name} is the name of a method: give {words!r} another name")
         return variant
 
@@ -102,12 +102,6 @@ class Variant:
         """The half of the facade that no cue supervises."""
         half = getattr(self.config.pipeline.datamanager, "holdout", "none")
         return half if half in HALVES else None
-
-
-def _definition(name: str) -> tuple[str, tuple[str, ...]]:
-    """Method and flags of a method or ablation."""
-    method, *flags = ABLATIONS.get(name, (name,))
-    return method, tuple(flags)
 
 
 @dataclass(frozen=True)
@@ -312,12 +306,10 @@ def recorded_settings(path: Path) -> dict:
         DamagedRunError: the file is damaged.
     """
     try:
-        before = json.loads(path.read_text())
-        if isinstance(before, dict):
-            return before
-    except ValueError:
-        pass
-    raise DamagedRunError(f"{path} is damaged, so the settings of the run are unknown: remove {path.parent}")
+        return read_json(path)
+    except SceneError as error:
+        what = f"{path} is damaged, so the settings of the run are unknown: remove {path.parent}"
+        raise DamagedRunError(what) from error
 
 
 def grid(

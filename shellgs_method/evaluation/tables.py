@@ -96,8 +96,8 @@ def markdown_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = 
 
 def latex_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
     """The table of :func:`markdown_table` as a LaTeX tabular with booktabs."""
-    head = ["Method", *(column.heading for column in columns)]
-    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", _latex_line(head), r"\midrule"]
+    head = " & ".join(["Method", *(column.heading.translate(_LATEX) for column in columns)]) + r" \\"
+    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", head, r"\midrule"]
     for method, cells in _cells(rows, columns, quoted):
         texts = [rf"\textbf{{{text.translate(_LATEX)}}}" if best else text.translate(_LATEX) for text, best in cells]
         lines.append(" & ".join([method.translate(_LATEX), *texts]) + r" \\")
@@ -222,10 +222,6 @@ def _mean(values: float | Sequence[float]) -> float | None:
 
 def _deviation(values: float | Sequence[float]) -> float | None:
     return float(np.std(values, ddof=1)) if np.size(values) > 1 else None
-
-
-def _latex_line(texts: Sequence[str]) -> str:
-    return " & ".join(text.translate(_LATEX) for text in texts) + r" \\"
 
 
 def against_truth(metrics: Mapping[str, float]) -> dict[str, float]:

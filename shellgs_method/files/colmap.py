@@ -159,7 +159,7 @@ def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
         SceneError: a file is damaged, or a camera is invalid.
     """
     cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
-    files = _files(scene, folder, images_path)
+    files = NamedFiles(scene, images_path, scene / folder)
     images = _images(scene / folder)
     frames = [_frame(scene, _path(image.name, files), image, cameras, folder) for image in images.values()]
     listed = _listed(files)
@@ -173,7 +173,7 @@ def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, M
     Raises:
         SceneError: a file is damaged.
     """
-    files = _files(scene, folder, images_path)
+    files = NamedFiles(scene, images_path, scene / folder)
     names = {number: _path(image.name, files) for number, image in _images(scene / folder).items()}
     if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
         return _points([], [], [], []), names
@@ -244,10 +244,6 @@ def _is_model(folder: Path) -> bool:
 
 def _images(folder: Path) -> dict[int, ColmapImage]:
     return _read(folder, "images", _binary_images, _text_images)
-
-
-def _files(scene: Path, folder: Path, images_path: Path) -> NamedFiles:
-    return NamedFiles(scene, images_path, scene / folder)
 
 
 def _path(name: str, files: NamedFiles) -> str:

@@ -123,7 +123,7 @@ _OF_IMAGES: _OfPoses = (
 
 def slips() -> Iterator[Slip]:
     """Usual mistakes, likelier ones first: axes that are usually confused, units, any axes, axes with units."""
-    axes = {tuple(s * (k + 1) for s, k in zip(signs, order, strict=True)): _signed(order, signs)
+    axes = {tuple(s * (k + 1) for s, k in zip(signs, order, strict=True)): np.diag(signs) @ np.eye(3)[list(order)]
             for order in permutations(range(3)) for signs in product((1, -1), repeat=3)}  # fmt: skip
     del axes[1, 2, 3]
     turned = {numbers: Slip(_axes_in_words(numbers), matrix) for numbers, matrix in axes.items()}
@@ -131,10 +131,6 @@ def slips() -> Iterator[Slip]:
     yield from (turned[numbers] for numbers in _AXES)
     yield from scaled
     yield from (slip for numbers, slip in turned.items() if numbers not in _AXES)
-
-
-def _signed(order: Sequence[int], signs: Sequence[int]) -> np.ndarray:
-    return np.diag(signs) @ np.eye(3)[list(order)]
 
 
 def _axes_in_words(numbers: tuple[int, ...]) -> str:

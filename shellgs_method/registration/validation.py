@@ -166,6 +166,12 @@ class Validation:
         close = self.signed[np.abs(self.signed) < OCCLUDING]
         return float(np.median(close)) if len(close) else float("nan")
 
+    @property
+    def check_points(self) -> float:
+        """Median residual of the check points in metres; NaN if there are none."""
+        residuals = [point.residual for point in self.correspondences if point.held_out]
+        return float(np.median(residuals)) if residuals else float("nan")
+
     def metrics(self) -> dict[str, float | None]:
         """Main metrics, for json."""
         values = {f"within_{round(100 * d)}cm": self.share_within(d) for d in (0.05, 0.10, 0.20)}
@@ -174,8 +180,8 @@ class Validation:
             values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
         values["rounding_m"] = rounding_of(self.steps)
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
-        if held := [p.residual for p in self.correspondences if p.held_out]:
-            values["check_points_m"] = float(np.median(held))
+        if not np.isnan(self.check_points):
+            values["check_points_m"] = self.check_points
         return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
 
 
@@ -196,15 +202,9 @@ class Unbending:
         before, now = self.adjustment.held_out.pixels
         name = "Bent: reprojection error of tracks held out, relative to the one before"
         yield _check("bent_pixels", now / before if before else 1.0, name, "{:.2f}")
-        held = [_check_points(validation) for validation in (self.before, after)]
-        if not np.isnan(held).any():
-            name = "Bent: check points, median residual, less the one before"
-            yield _check("bent_check", held[1] - held[0], name, "{:+.3f} m")
-
-
-def _check_points(validation: Validation) -> float:
-    residuals = [point.residual for point in validation.correspondences if point.held_out]
-    return float(np.median(residuals)) if residuals else float("nan")
+        farther = after.check_points - self.before.check_points
+        if not np.isnan(farther):
+            yield _check("bent_check", farther, "Bent: check points, median residual, less the one before", "{:+.3f} m")
 
 
 def validate(
@@ -311,8 +311,8 @@ def _checks(measured: Validation) -> Iterator[Check]:
         yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
     if measured.mirrored is not None:
         yield _check("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
-    if held_out := [p.residual for p in measured.correspondences if p.held_out]:
-        yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
+    if not np.isnan(measured.check_points):
+        yield _check("check", measured.check_points, "Check points, median residual", "{:.3f} m")
 
 
 def _check(key: str, value: float, name: str, form: str) -> Check:
