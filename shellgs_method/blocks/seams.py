@@ -123,7 +123,7 @@ def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
         batch, camera = held_out.get_data(index), held_out.camera(index).to(dtype=torch.float32)
         if (shell := references(batch, torch.device("cpu")).get("")) is None:
             continue
-        outputs = {name: each.cpu() for name, each in _render(run, index).items()}
+        outputs = {name: each.cpu() for name, each in run.outputs(held_out, index).items()}
         near = _near(camera, shell.depth, cells, NEAR / metres)
         rgb, normal = outputs["rgb"], colours_to_normals(outputs["normal"])
         rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
@@ -158,11 +158,6 @@ def _cells(run: TrainedRun) -> Sequence[Cell]:
     """The cells in the world of the model."""
     blocks = Blocks.read(run.scene / BLOCKS)
     return [cell.moved(run.datamanager.scene_to_world) for cell in blocks.cells]
-
-
-def _render(run: TrainedRun, index: int) -> dict[str, Tensor]:
-    cameras = run.datasets[1].cameras[index : index + 1]
-    return run.model.get_outputs_for_camera(cameras.to(run.model.device))
 
 
 def from_cuts(points: Float[np.ndarray, "N 3"], cells: Sequence[Cell]) -> Float64[np.ndarray, "N"]:

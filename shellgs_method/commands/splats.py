@@ -52,7 +52,7 @@ def splats(
         gaussians = moved(gaussians, motion)
         facts["turned"] = motion[:3, :3].tolist()
     comments = [f"{name}: {value}" for name, value in frame.properties.items()]
-    photographs = sorted((view for dataset in run.datasets for view in dataset.views), key=lambda view: view.name)
+    photographs = sorted(run.photographs, key=lambda view: view.name)
     views = [frame.camera(view.camera) for view in photographs]
 
     def size(some: Splats) -> int:

@@ -101,7 +101,7 @@ def shell_and_walls(run: TrainedRun) -> tuple[Triangles, list[Wall]]:
     if run.shell is None:
         raise SceneError("an elevation needs the aligned shell, which says what is upright and how long a metre is")
     shell = run.shell_in_frame
-    cameras = [run.frame.camera(view.camera) for dataset in run.datasets for view in dataset.views]
+    cameras = [run.frame.camera(view.camera) for view in run.photographs]
     surface, _ = outward(Triangles(shell.vertices, shell.faces), positions(cameras))
     walls = find_walls(surface, cameras, run.frame.up)
     if not walls:

@@ -87,6 +87,15 @@ class TrainedRun:
         return self.datamanager.train_dataset, self.datamanager.eval_dataset
 
     @property
+    def photographs(self) -> list[View]:
+        """The photographs of both."""
+        return [view for dataset in self.datasets for view in dataset.views]
+
+    def outputs(self, dataset: FacadeDataset, index: int) -> dict[str, Tensor]:
+        """What the model renders of a view of one of them."""
+        return self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.model.device))
+
+    @property
     def scene(self) -> Path:
         """The scene's folder."""
         return Path(self.datamanager.config.dataparser.data)
@@ -102,16 +111,15 @@ class TrainedRun:
         if not (self.scene / ALIGNMENT).is_file():
             return None
         alignment = Alignment.load(self.scene / ALIGNMENT)
-        views = [view for dataset in self.datasets for view in dataset.views]
-        alignment.check(self.scene, views)
-        alignment = alignment if alignment.cameras.cameras else alignment.bound(self.scene, views)
-        return alignment, alignment.load_shell(self.scene, views)
+        alignment.check(self.scene, self.photographs)
+        alignment = alignment if alignment.cameras.cameras else alignment.bound(self.scene, self.photographs)
+        return alignment, alignment.load_shell(self.scene, self.photographs)
 
     @cached_property
     def frame(self) -> Frame:
         """The shell's frame in metres, else the scene's."""
         if self.shell is None:
-            cameras = [view.camera for dataset in self.datasets for view in dataset.views]
+            cameras = [view.camera for view in self.photographs]
             return scene_frame(likely_up(cameras), positions(cameras).mean(axis=0))
         alignment, shell = self.shell
         return shell_frame(alignment, shell, usual_up(alignment.shells) if alignment.up is None else alignment.up)
@@ -173,7 +181,7 @@ class TrainedRun:
     def footprints(self, box: Box) -> list[float]:
         """A pixel's size at the SfM points inside a box, in each view that shows enough, in the frame's unit."""
         points = self.sfm_points[box.contains(self.sfm_points)]
-        cameras = [self.frame.camera(view.camera) for dataset in self.datasets for view in dataset.views]
+        cameras = [self.frame.camera(view.camera) for view in self.photographs]
         depths = [(in_view(camera, points)[2], float(camera.K[0, 0])) for camera in cameras]
         return [float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY]
 
@@ -227,7 +235,7 @@ class TrainedRun:
         depth_scale = 1 / (self.model_scale * self.frame.scale)
         indexed = [(dataset, index) for dataset in self.datasets for index in range(len(dataset.views))]
         for dataset, index in track(indexed, "Rendering view", len(indexed)):
-            outputs = self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.model.device))
+            outputs = self.outputs(dataset, index)
             depth = (outputs["depth"] * depth_scale).where(outputs["accumulation"] >= OPAQUE, 0.0).cpu()
             kept = load_mask(dataset.views[index])
             if kept is not None:
@@ -250,7 +258,7 @@ class TrainedRun:
             return np.zeros((len(training) + len(held_out), 3))
         gains = [*learned.log_gains.cpu().double().numpy()]
         for index in range(len(held_out)):
-            render = self.model.get_outputs_for_camera(held_out.cameras[index : index + 1].to(self.model.device))["rgb"]
+            render = self.outputs(held_out, index)["rgb"]
             photograph = held_out.get_numpy_image(index) / 255
             kept = load_mask(held_out.views[index])
             both = np.stack([render.cpu().double().numpy(), photograph])

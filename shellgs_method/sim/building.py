@@ -102,7 +102,7 @@ class Reconstruction:
         Raises:
             SceneError: nothing is rendered, or the building does not fit into that world.
         """
-        views = [view for dataset in run.datasets for view in dataset.views]
+        views = run.photographs
         hidden: list[np.ndarray] = []
         below: list[np.ndarray] = [run.sfm_points]
         surface = run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden, below))
@@ -218,7 +218,7 @@ def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray], below: list
     Append to ``below`` the points of its depth that are on level surfaces lower than the camera.
     """
     caster = ShellCaster(run.shell_in_frame, np.eye(4)) if run.shell else None
-    apart = ground_step(view.camera for dataset in run.datasets for view in dataset.views)
+    apart = ground_step(view.camera for view in run.photographs)
     for view in run.views():
         step = view.camera.thinning(HIDDEN_SIZE)
         occluded = np.zeros(view.depth[::step, ::step, 0].shape, bool)
