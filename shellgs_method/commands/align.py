@@ -222,7 +222,7 @@ def _written(
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.align import REPORT, seen_again, unbent, up_in_words
     from shellgs_method.registration.report import write_report
-    from shellgs_method.registration.units import unit_in_words
+    from shellgs_method.registration.units import with_unit
     from shellgs_method.registration.validation import validate
     from shellgs_method.shell.cast import renew_error
 
@@ -240,9 +240,11 @@ def _written(
                 placement = seen_again(placement, views, picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
-        validated = validation.validated(scene, views)
-        told = [up_in_words(validated), unit_in_words(replace(validation, alignment=validated), mesh, views)]
-        placement = replace(placement, history=[*placement.history, *filter(None, told)])
+        bound = replace(validation, alignment=validation.alignment.bound(scene, views))
+        validation, unit = with_unit(bound, mesh, views)
+        validated = replace(validation.alignment, verdict=validation.verdict, metrics=validation.metrics())
+        told = filter(None, [up_in_words(validated), unit])
+        placement = replace(placement, history=[*placement.history, *told])
         write_report(scene / REPORT, mesh, validation, placement.history)
         if validation.verdict != "refused":
             if candidate.is_dir():

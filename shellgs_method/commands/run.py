@@ -315,6 +315,7 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
         SceneError: the alignment is refused, doubtful, or a proposal, and not accepted.
     """
     from shellgs_method.registration.align import PROPOSAL, REPORT
+    from shellgs_method.registration.validation import LIKELIER
     from shellgs_method.shell import Alignment
 
     files = *shell, recipe.matrix, recipe.picks, recipe.positions, *_cameras(scene)
@@ -351,12 +352,17 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
         raise SceneError(f"{error}; {remedy} in {scene}.run") from error
     if accept:
         steps.done("accepted", *inputs)
-    if not (accept or accepted) and (proposed or Alignment.load(scene / ALIGNMENT).verdict != "good"):
+    if accept or accepted:
+        return
+    aligned = Alignment.load(scene / (PROPOSAL if proposed else ALIGNMENT))
+    if proposed or aligned.verdict != "good":
         open_page(report)
-        state = "a proposal" if proposed else "doubtful"
+        state, right = "a proposal" if proposed else "doubtful", f"the images in {report} agree"
+        if likelier := aligned.metrics.get(LIKELIER):
+            right, remedy = f"{right} and its unit is right", f"have --metres-per-shell-unit {likelier:g}, or {remedy}"
         raise SceneError(
-            f"the alignment is {state}: if the images in {report} agree, go on with `shellgs run --scene {named} "
-            f"--accept`; else {remedy} in {scene}.run"
+            f"the alignment is {state}: if {right}, go on with `shellgs run --scene {named} --accept`; else {remedy} "
+            f"in {scene}.run"
         )
 
 

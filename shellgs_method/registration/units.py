@@ -7,13 +7,16 @@ never corrected.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePath
 
 import numpy as np
 
+from shellgs_method.files.crs import IN_METRES
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.validation import Validation
+from shellgs_method.registration.validation import Check, Validation
 from shellgs_method.shell.mesh import ShellMesh
 
 _UNITS = {1.0: "metre", 0.001: "millimetre", 0.01: "centimetre", 0.3048: "foot", 0.0254: "inch"}
@@ -28,12 +31,16 @@ _SURE = 2.5
 """Difference of the logarithms of two likelihoods from which the one is doubted: twelve times as likely."""
 
 
-def unit_in_words(validation: Validation, mesh: ShellMesh, views: Sequence[View]) -> str | None:
-    """How large people and storeys are by the shell's unit, and whether another one is more likely; None if unknown."""
+def with_unit(validation: Validation, mesh: ShellMesh, views: Sequence[View]) -> tuple[Validation, str | None]:
+    """A validation that doubts a unit if another one is more likely, and how large people and storeys are by it.
+
+    A unit that is known, by the file or its coordinate reference system, is not doubted. None in place of words that
+    are unknown, or those of the doubt.
+    """
     alignment = validation.alignment
     distances = [support.distance for support in validation.views if len(support.hits)]
     if not distances or alignment.up is None:
-        return None
+        return validation, None
     metres = alignment.metres_per_shell_unit
     eyes = transformed(positions(view.camera for view in views), np.linalg.inv(alignment.shell_to_scene))
     heights = metres * (mesh.vertices - mesh.centre) @ alignment.up
@@ -42,20 +49,31 @@ def unit_in_words(validation: Validation, mesh: ShellMesh, views: Sequence[View]
     storeys = [scan.period for scan in validation.scans if scan.name == "upwards" and scan.period]
     lengths = dict(zip(_USUAL, (float(np.median(distances)), float(top - foot), eye, *storeys), strict=False))
     known = {words: length for words, length in lengths.items() if length > 0}
+    read_in_metres = all(PurePath(shell).suffix.lower() in IN_METRES for shell in alignment.shells)
+    if not (alignment.crs or read_in_metres) and (likelier := likelier_unit(known, metres)):
+        return replace(
+            validation, checks=[*validation.checks, _doubt(known, metres, likelier)], likelier=likelier
+        ), None
     unit = f"the {_UNITS[metres]}" if metres in _UNITS else f"{metres:g} m"
-    return doubted(known, metres) or f"With {unit} as the shell's unit, {_in_words(known)}."
+    return validation, f"With {unit} as the shell's unit, {_in_words(known)}."
 
 
-def doubted(lengths: Mapping[str, float], metres_per_unit: float) -> str | None:
-    """A sentence that asks for another unit if lengths in metres, by their words, are more usual with it."""
+def likelier_unit(lengths: Mapping[str, float], metres_per_unit: float) -> float | None:
+    """Metres of another unit with which lengths in metres, by their words, are far more usual; None if of none."""
     likely = {unit: _unlikely([v * unit / metres_per_unit for v in lengths.values()], [*lengths]) for unit in _UNITS}
     best = min(likely, key=lambda unit: likely[unit])
-    if metres_per_unit not in likely or likely[metres_per_unit] < likely[best] + _SURE:
-        return None
-    then = {words: length * best / metres_per_unit for words, length in lengths.items()}
-    return (
-        f"Is the shell's unit the {_UNITS[best]}, not the {_UNITS[metres_per_unit]}? Now {_in_words(lengths)}; with "
-        f"--metres-per-shell-unit {best:g} {_in_words(then)}. The unit was not changed."
+    return best if metres_per_unit in likely and likely[metres_per_unit] >= likely[best] + _SURE else None
+
+
+def _doubt(lengths: Mapping[str, float], metres: float, likelier: float) -> Check:
+    then = {words: length * likelier / metres for words, length in lengths.items()}
+    return Check(
+        "The shell's unit",
+        f"the {_UNITS[metres]}",
+        f"doubted if another one is {np.exp(_SURE):.0f} times as likely",
+        "doubtful",
+        f"is it the {_UNITS[likelier]}? Now {_in_words(lengths)}; with --metres-per-shell-unit {likelier:g} "
+        f"{_in_words(then)}",
     )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -82,6 +81,9 @@ LIMITS = {
 }
 """All thresholds of the verdict, with their reasons."""
 
+LIKELIER = "likelier_metres_per_shell_unit"
+"""The metric of a unit that is more likely than the shell's own."""
+
 SHOWN = 0.005
 """Metres from which a step of coordinates is shown in the report."""
 _REACH = 0.25  # metres: reach of the test refinement
@@ -116,6 +118,7 @@ class Validation:
         steps: steps of the coordinates in metres, by what they are of.
         unbending: how the cameras were adjusted to the shell, if they were.
         survey_from_scene: the place of the scene in the survey frame.
+        likelier: metres of a unit that the shell has more likely than its own; None if it has its own.
     """
 
     alignment: Alignment
@@ -131,6 +134,7 @@ class Validation:
     steps: Mapping[str, Step] = field(default_factory=dict)
     unbending: Unbending | None = None
     survey_from_scene: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    likelier: float | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -142,10 +146,6 @@ class Validation:
         """Checks that are not good, the worst first, in words."""
         not_good = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
         return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in not_good]
-
-    def validated(self, scene: Path, views: Sequence[View]) -> Alignment:
-        """The alignment with its verdict and metrics, bound to the shell and the views that it was validated with."""
-        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics()).bound(scene, views)
 
     def with_checks(self, checks: Sequence[Check]) -> Validation:
         """This validation with more checks."""
@@ -182,6 +182,8 @@ class Validation:
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
         if not np.isnan(self.check_points):
             values["check_points_m"] = self.check_points
+        if self.likelier is not None:
+            values[LIKELIER] = self.likelier
         return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
 
 

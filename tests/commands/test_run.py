@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from shellgs_method.commands import run as run_command
 from shellgs_method.commands.run import Recipe
 from shellgs_method.registration.align import PROPOSAL
+from shellgs_method.registration.validation import LIKELIER
 from shellgs_method.shell import ALIGNMENT, Alignment
 
 
@@ -113,6 +115,23 @@ def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_a
     np.savetxt(matrix, far, fmt="%.17g")
     assert "the alignment is doubtful" in shellgs("run")
     assert len(calls) == 2
+
+
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs, shellgs, monkeypatch):
+    photographs, shell, matrix = inputs
+
+    def align(scene, shell, matrix, metres_per_shell_unit, **settings):
+        doubted = {"verdict": "doubtful", "metrics": {LIKELIER: 0.3048}} if metres_per_shell_unit == 1 else {}
+        replace(scene_alignment(inputs), **{"verdict": "good", **doubted}).save(scene / ALIGNMENT)
+
+    monkeypatch.setattr(run_command, "align", align)
+    told = shellgs("run", photographs, shell, "--matrix", matrix)
+    assert "index.html agree and its unit is right, go on with `shellgs run --scene scene --accept`" in told
+    assert "else have --metres-per-shell-unit 0.3048, or add --refine 0.3, or pick points" in told
+    with Path("scene.run").open("a") as settings:
+        settings.write("--metres-per-shell-unit 0.3048")
+    assert shellgs("run") == "refused: cast"
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")

@@ -15,8 +15,8 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.repetition import ShiftScan
 from shellgs_method.registration.support import ViewSupport
-from shellgs_method.registration.units import doubted, unit_in_words
-from shellgs_method.registration.validation import Validation
+from shellgs_method.registration.units import likelier_unit, with_unit
+from shellgs_method.registration.validation import LIKELIER, Validation
 from shellgs_method.shell import Alignment, ShellMesh
 
 HOUSE = (11.0, 10.5, 1.6, 3.3)  # metres: distance, height, eyes, storeys
@@ -28,32 +28,26 @@ WORDS = (
 )
 
 
-@pytest.mark.parametrize(("unit", "name"), [(0.001, "millimetre"), (0.01, "centimetre"), (0.0254, "inch")])
-def test_a_house_in_small_units_is_never_taken_for_one_in_metres(unit, name):
-    said = doubted({word: length / unit for word, length in zip(WORDS[:2], HOUSE, strict=False)}, 1.0)
-    assert said is not None
-    assert f"the {name}, not the metre" in said
-    assert f"--metres-per-shell-unit {unit:g} cameras stand 11 m from it" in said
+@pytest.mark.parametrize("unit", [0.001, 0.01, 0.0254])
+def test_a_house_in_small_units_is_never_taken_for_one_in_metres(unit):
+    assert likelier_unit({word: length / unit for word, length in zip(WORDS[:2], HOUSE, strict=False)}, 1.0) == unit
 
 
 @pytest.mark.parametrize("known", [3, 4])
 def test_feet_are_told_by_eyes_and_storeys(known):
-    said = doubted({word: length / 0.3048 for word, length in zip(WORDS[:known], HOUSE, strict=False)}, 1.0)
-    assert said is not None
-    assert "the foot, not the metre" in said
+    lengths = {word: length / 0.3048 for word, length in zip(WORDS[:known], HOUSE, strict=False)}
+    assert likelier_unit(lengths, 1.0) == 0.3048
 
 
 @pytest.mark.parametrize(
     "lengths", [HOUSE, (45.0, 25.0, 1.2, 4.5), (30.0, 9.0, 12.0, 2.8), (4.0, 6.0, 2.5, 3.0), (20.0, 40.0, 30.0)]
 )
 def test_usual_buildings_and_drones_in_metres_are_not_doubted(lengths):
-    assert doubted(dict(zip(WORDS, lengths, strict=False)), 1.0) is None
+    assert likelier_unit(dict(zip(WORDS, lengths, strict=False)), 1.0) is None
 
 
 def test_metres_given_as_millimetres_are_doubted():
-    said = doubted({word: 0.001 * length for word, length in zip(WORDS, HOUSE, strict=True)}, 0.001)
-    assert said is not None
-    assert "the metre, not the millimetre" in said
+    assert likelier_unit({word: 0.001 * length for word, length in zip(WORDS, HOUSE, strict=True)}, 0.001) == 1
 
 
 def test_lengths_of_a_shell_in_its_place_are_doubted():
@@ -76,17 +70,24 @@ def test_lengths_of_a_shell_in_its_place_are_doubted():
     scans = [ShiftScan("along the facade", at, at, 4 * foot), ShiftScan("upwards", at, at, 3.3 * foot)]
     alignment = Alignment(placed, ("house.ply",), foot, up=np.array([0.0, 0, 1]))
     validation = Validation(alignment, [], supports, scans=scans)
-    lengths = {word: length * foot for word, length in zip(WORDS, (14, 12, 1.6, 3.3), strict=True)}
-    said = unit_in_words(validation, mesh, views)
-    assert said is not None
-    assert "the metre, not the foot" in said
-    assert said == doubted(lengths, foot)
-    del lengths[WORDS[2]]
+    doubted, told = with_unit(validation, mesh, views)
+    assert told is None
+    assert doubted.verdict == "doubtful"
+    assert doubted.metrics()[LIKELIER] == 1
+    (said,) = doubted.reasons
+    assert said == (
+        "The shell's unit: the foot (doubted if another one is 12 times as likely); is it the metre? Now cameras stand "
+        "4.27 m from it, it is 3.66 m high, cameras are 0.488 m above its lower edge, its storeys are 1.01 m high; "
+        "with --metres-per-shell-unit 1 cameras stand 14 m from it, it is 12 m high, cameras are 1.6 m above its lower "
+        "edge, its storeys are 3.3 m high"
+    )
     above = ShellMesh(mesh.vertices + np.array([0, 0, 10]), mesh.faces)  # eyes below the lower edge tell nothing
-    assert unit_in_words(validation, above, views) == doubted(lengths, foot)
-    assert doubted(lengths, 0.5) is None  # a unit without a name
-    halved = replace(validation, alignment=replace(alignment, metres_per_shell_unit=0.5))
-    said = "With 0.5 m as the shell's unit, cameras stand 4.27 m from it, it is 6 m high, cameras are"
-    assert str(unit_in_words(halved, mesh, views)).startswith(said)
-    assert unit_in_words(replace(validation, views=supports[1:]), mesh, views) is None
-    assert unit_in_words(replace(validation, alignment=replace(alignment, up=None)), mesh, views) is None
+    assert "lower edge" not in with_unit(validation, above, views)[0].reasons[0]
+    for other in ({"crs": "EPSG:25832"}, {"shells": ("house.ifc",)}, {"metres_per_shell_unit": 0.5}):
+        known = replace(validation, alignment=replace(alignment, **other))
+        same, told = with_unit(known, mesh, views)  # of a unit without a name nothing is more likely
+        assert same is known
+        assert told is not None
+    assert str(told).startswith("With 0.5 m as the shell's unit, cameras stand 4.27 m from it, it is 6 m high, cameras")
+    for unknown in ({"views": supports[1:]}, {"alignment": replace(alignment, up=None)}):
+        assert with_unit(replace(validation, **unknown), mesh, views)[1] is None
