@@ -17,10 +17,11 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from dataparsers.cameras import pinhole_cameras
 from dataparsers.orientation import oriented
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.frames import Frame, Recording, are_far
+from shellgs_method.files.paths import copies_among
 from shellgs_method.files.photographs import View, tell_of_other_sizes
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
@@ -98,6 +99,8 @@ class FacadeDataParser(DataParser):
         points = find_sparse_points(config)
         if split == "train":
             check_points(points, views)
+        else:
+            _tell_of_copies(recording, whole, config)
         placed = scale * (points.positions @ transform[:3, :3].T + transform[:3, 3])
         metres_per_unit = shell.metres_per_unit if shell else None
         to_world = np.eye(4)
@@ -213,6 +216,24 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     if len(names) < 2:
         raise SceneError(f"{config.data} has one photograph: one is held out, and training needs at least one more")
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
+
+
+def _tell_of_copies(recording: Recording, held_out: Sequence[int], config: FacadeDataParserConfig) -> None:
+    """Tell the user of held-out photographs that are trained on as well, as a copy of the file."""
+    names = {frame.image: frame.name for frame in recording.frames}
+    same: dict[Path, set[str]] = {}
+    for copy, original in copies_among(names).items():
+        same.setdefault(original, {names[original]}).add(names[copy])
+    held, trained = (
+        {recording.frames[k].name for k in each} for each in (held_out, _of_split(recording, "train", config))
+    )
+    both = {name: min(group & trained) for group in same.values() if group & trained for name in group & held}
+    if both:
+        one, other = min(both.items())
+        notice(
+            f"{len(both)} of {len(held)} held-out photographs of {config.data} are copies of others that are trained "
+            f"on ({one} of {other}, for example): metrics of these are too good; take one of the two out of the scene."
+        )
 
 
 def _of_block(

@@ -39,6 +39,7 @@ _PAUSE = 10.0  # seconds between two frames that are no step, but a break, as wh
 _TIMED = ("mov", "avi")  # formats that say how long a stream is
 _WHOLE = 0.9  # of that time, is as good as all
 _BLACK = 32  # levels that compressed black reaches
+_HELD = 0.04  # of the contrast, by which frames may differ that show the same: as if it moved by 0.3 % of the width
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
@@ -65,9 +66,16 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             "are cut off."
         )
     task = progress.add_task("keeping the sharpest", total=len(chosen))
+    before, held = None, 0
     with _opened(video) as (container, stream):
         for number, frame in enumerate(_frames(container, stream)):
             if number in chosen:
+                progress.advance(task)
+                small = _small(frame).astype(np.float32)
+                if before is not None and _is_held(before, small):
+                    held += 1
+                    continue
+                before = small
                 if frame.interlaced_frame:
                     notice(
                         f"{video} is interlaced: where it moves, every other line of a frame is interpolated, as it is "
@@ -75,7 +83,20 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                     )
                 image = _upright(frame, transfer, aspect, (right, down, frame.width - right, frame.height - down))
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
-                progress.advance(task)
+    if held:
+        notice(
+            f"{held} of {len(chosen)} frames of {video} show the same as the one before, where the picture stands "
+            "still, and are left out."
+        )
+
+
+def _small(frame: av.VideoFrame) -> UInt8[np.ndarray, "H W"]:
+    height = max(1, round(_SMALL * frame.height / frame.width))
+    return frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
+
+
+def _is_held(before: Float[np.ndarray, "H W"], after: Float[np.ndarray, "H W"]) -> bool:
+    return before.shape == after.shape and bool(np.abs(after - before).mean() < _HELD * after.std())
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +135,7 @@ def _measured(
         times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
         last, end = frame.time, max(end, (frame.time or 0.0) + max(usual, frame.duration * (frame.time_base or 0)))
         if not marks or times[-1] >= marks[-1] + _PACE:
-            height = max(1, round(_SMALL * frame.height / frame.width))
-            small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
+            small = _small(frame)
             marks.append(times[-1])
             shifts.append(shift(small if before is None or before.shape != small.shape else before, small))
             before = small

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import filecmp
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -26,6 +25,7 @@ from shellgs_method.files.paths import (
     PHOTOGRAPHS,
     RAW,
     captured_name,
+    copies_among,
     files_below,
     is_hidden,
     mask_names,
@@ -36,7 +36,6 @@ from shellgs_method.files.paths import (
 from shellgs_method.files.profiles import is_srgb
 from shellgs_method.files.transfer import DARK
 
-_EXCERPT = 4096  # bytes
 _THUMBNAIL = 320  # pixels of a photograph whose brightness is measured
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
@@ -52,8 +51,9 @@ _LENS_TAGS = (
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
 _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neighbours by time
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
-# at most, at a tenth of the light, others 0.28 and more.
-_SMALL, _ALIKE = 32, 0.15
+# at most, at a tenth of the light, others 0.28 and more. Of the same size, those encoded again have 0.02 and
+# others 0.19 and more.
+_SMALL, _ALIKE, _SAME = 32, 0.15, 0.04
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of EXIF's units of resolution: inch, centimetre, millimetre
 _SHRUNK = 0.9  # of a photograph's size in EXIF; a camera may write a few pixels more than it stores
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
@@ -114,14 +114,7 @@ def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
 
     A view would be trained on whose copy is held out.
     """
-    originals: dict[tuple[int, bytes], Path] = {}
-    copies: dict[Path, Path] = {}
-    for path in sorted(photographs, key=lambda path: (len(path.name), path)):  # "a copy.jpg" is the copy of "a.jpg"
-        if not path.is_file() or not (size := path.stat().st_size):
-            continue
-        original = originals.setdefault((size, _excerpt(path, size)), path)
-        if original != path and filecmp.cmp(original, path, shallow=False):
-            copies[path] = original
+    copies = copies_among(photographs)
     copies |= _smaller_copies([path for path in photographs if path not in copies])
     if copies:
         copy, original = min(copies.items())
@@ -190,13 +183,6 @@ def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
             f"({second.name} at that of {first.name}, for example): if they are edited versions, move one of the two "
             "away, or metrics of held-out photographs are too good."
         )
-
-
-def _excerpt(path: Path, size: int) -> bytes:
-    """Some bytes of the middle of a file, by which few differ that are not the same."""
-    with path.open("rb") as file:
-        file.seek(size // 2)
-        return file.read(_EXCERPT)
 
 
 def add_photograph(source: Path, target: Path) -> None:
@@ -409,6 +395,21 @@ def contrast(path: Path) -> float:
         grey = image.convert("L")
         grey.thumbnail((_THUMBNAIL, _THUMBNAIL))
     return min(1.0, 2.0 ** round(np.log2(max(float(np.median(np.asarray(grey))), 1.0) / DARK)))
+
+
+def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
+    """Tell the user of photographs that show the same as others, as those that a messenger encoded again."""
+    small = np.stack([_small(folder / name) for name in names])
+    copies = [
+        (name, names[int(alike.argmax())])
+        for k, name in enumerate(names)
+        if (alike := np.abs(small[:k] - small[k]).mean((1, 2)) < _SAME * small[k].std()).any()
+    ]
+    if copies:
+        notice(
+            f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, for "
+            "example): of copies, move one of the two away, or metrics of held-out photographs are too good."
+        )
 
 
 def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:

@@ -45,6 +45,7 @@ from shellgs_method.capture.photographs import (
     keep_exposure,
     masks_as_stored,
     tell_of_another_order,
+    tell_of_near_copies,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -249,6 +250,8 @@ class _Capture:
             tell_of_a_rig(ordinary)
             if not self.is_video:
                 tell_of_unknown_lenses(self.folder, ordinary)
+        if ordinary and not self.is_video:
+            tell_of_near_copies(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         with _counting(database) as rows:

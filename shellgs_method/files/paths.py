@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import unicodedata
 import warnings
@@ -28,6 +29,7 @@ RAW = frozenset(
     )
 )
 """Suffixes of what sensors recorded, in lower case: Pillow reads a thumbnail of some, and nothing of others."""
+_EXCERPT = 4096  # bytes
 _CODE_PAGES = ("cp1252", "cp1250", "cp1251", "gbk", "cp932", "cp949", "big5")
 """Encodings of names that programs on Windows wrote in the language of the machine."""
 DEVELOP = "export it as JPEG, or as PNG or TIFF of 8 or 16 bits, with the program that develops it"
@@ -228,6 +230,26 @@ def photographs_in(folder: Path, *, deep: bool) -> list[Path]:
     found = sorted(files_below(folder) if deep else folder.glob("*"))
     photographs = (path for path in found if path.suffix.lower() in PHOTOGRAPHS and not path.is_dir())
     return [path for path in photographs if not is_hidden(path.relative_to(folder))]
+
+
+def copies_among(files: Iterable[Path]) -> dict[Path, Path]:
+    """Those files that are byte by byte another one, and that one: "a copy.jpg" is the copy of "a.jpg"."""
+    originals: dict[tuple[int, bytes], Path] = {}
+    copies: dict[Path, Path] = {}
+    for path in sorted(files, key=lambda path: (len(path.name), path)):
+        if not path.is_file() or not (size := path.stat().st_size):
+            continue
+        original = originals.setdefault((size, _excerpt(path, size)), path)
+        if original != path and filecmp.cmp(original, path, shallow=False):
+            copies[path] = original
+    return copies
+
+
+def _excerpt(path: Path, size: int) -> bytes:
+    """Some bytes of the middle of a file, by which few differ that are not the same."""
+    with path.open("rb") as file:
+        file.seek(size // 2)
+        return file.read(_EXCERPT)
 
 
 def is_hidden(path: PurePath) -> bool:

@@ -42,6 +42,7 @@ from shellgs_method.capture.photographs import (
     keep_exposure,
     masks_as_stored,
     tell_of_another_order,
+    tell_of_near_copies,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -98,6 +99,22 @@ def test_no_blurred_frame_of_a_video_is_extracted(tmp_path):
     taken = numbers(tmp_path / "frames")
     assert len(taken) == 8
     assert not blurred & set(taken)
+
+
+def test_frames_that_a_video_holds_are_extracted_once_and_this_is_told(tmp_path, caplog):
+    """As a slide show does, at whose steps many frames are taken; a picture that creeps is no still."""
+    wide = photograph(480, 96).resize((960, 192))
+    stills = [wide.crop((160 * k, 0, 160 * k + 320, 192)) for k in range(4)]
+    creeping = [wide.resize((1920, 384)).crop((k, 0, 640 + k, 384)).resize((320, 192)) for k in range(40)]
+    for name, frames in {"show": [still for still in stills for _ in range(30)], "slow": creeping}.items():
+        write_video(tmp_path / f"{name}.mp4", frames)
+        (tmp_path / name).mkdir()
+        extract_frames(tmp_path / f"{name}.mp4", tmp_path / name, 200, QUIET)
+    assert {number // 30 for number in numbers(tmp_path / "show")} == {0, 1, 2, 3}
+    assert len(numbers(tmp_path / "show")) == 4
+    assert "show.mp4 show the same as the one before" in caplog.text
+    assert len(numbers(tmp_path / "slow")) > 3
+    assert "slow.mp4" not in caplog.text
 
 
 def test_sharpness_is_relative_to_the_neighbourhood():
@@ -591,6 +608,17 @@ def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog, l
     assert list(find_photographs(tmp_path)) == found
     assert "5 photographs of" in caplog.text
     assert "(images_2/1.jpg is images/1.jpg, for example)" in caplog.text
+
+
+def test_photographs_that_were_encoded_again_are_told(tmp_path, caplog):
+    for k in range(3):
+        photograph(64, 48, seed=k).resize((640, 480)).save(tmp_path / f"IMG_{k}.jpg")
+    tell_of_near_copies(tmp_path, ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"])
+    assert not caplog.text
+    with Image.open(tmp_path / "IMG_1.jpg") as image:
+        image.resize((320, 240)).save(tmp_path / "sent.jpg", quality=50)
+    tell_of_near_copies(tmp_path, ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "sent.jpg"])
+    assert "1 of 4 photographs show the same as others (sent.jpg as IMG_1.jpg, for example)" in caplog.text
 
 
 @pytest.mark.parametrize(("fraction", "told"), [("123", True), ("00", False), (None, False)])

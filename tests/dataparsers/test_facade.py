@@ -758,6 +758,15 @@ def test_photographs_in_the_lists_of_training_and_of_a_held_out_split_are_counte
     assert "take them out of train_filenames" in caplog.text
 
 
+@pytest.mark.parametrize(("copy", "told"), [(2, True), (9, False)])
+def test_a_held_out_photograph_whose_copy_is_trained_on_is_told(scene, caplog, copy, told):
+    """The first and the ninth are held out: of these two, neither is trained on."""
+    shutil.copy(scene / "images/frame_00001.png", scene / f"images/frame_{copy:05d}.png")
+    parse(scene, "test")
+    assert ("1 of 2 held-out photographs of" in caplog.text) == told
+    assert ("(images/frame_00001.png of images/frame_00002.png, for example)" in caplog.text) == told
+
+
 @pytest.mark.parametrize("empty", ["val", "test"])
 def test_an_empty_list_is_that_of_a_split_that_is_not_used(scene, empty):
     transforms = json.loads((scene / "transforms.json").read_text())
