@@ -117,7 +117,7 @@ def _least_bytes(element: PlyElement) -> int:
 
 
 def _check_lines(path: Path, length: int, elements: list[PlyElement]) -> None:
-    with path.open("rb") as file:
+    with path.open(encoding="latin-1") as file:  # lines may end as on old Macs
         file.seek(length)
         there = sum(1 for line in file if line.strip())
     for element in elements:

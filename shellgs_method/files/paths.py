@@ -17,7 +17,9 @@ from shellgs_method.errors import SceneError, notice
 register_heif_opener()  # Pillow reads those of phones (.heic) from here on
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # of phones too: 108 megapixels
 
-PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif"))
+PHOTOGRAPHS = frozenset(
+    (".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif")
+)
 """Suffixes of photographs, in lower case."""
 CAPTURED = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
 """Suffixes and formats of photographs that keep their format in a capture; others become PNG."""

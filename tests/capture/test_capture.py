@@ -656,6 +656,13 @@ def test_photographs_of_a_phone_are_read_in_any_case_of_their_suffix(tmp_path):
         assert image.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
 
 
+def test_photographs_that_browsers_save_on_windows_are_read(tmp_path):
+    photograph().save(tmp_path / "a.JFIF", "JPEG")
+    add_photograph(find_photographs(tmp_path)["a.png"], tmp_path / "work" / "a.png")
+    with Image.open(tmp_path / "work" / "a.png") as image:
+        assert image.size == photograph().size
+
+
 @pytest.mark.parametrize("name", ["a.NEF", "b/c.dng", "IMG_1.CR3", "x.arw"])
 def test_raw_photographs_are_refused_at_once(tmp_path, name):
     photograph().save(tmp_path / "developed.jpg")

@@ -602,6 +602,31 @@ def test_only_blanks_may_follow_the_triangles_of_a_binary_stl(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off"])
+@pytest.mark.parametrize("end", ["\r", "\r\n"])
+def test_lines_of_a_mesh_of_text_may_end_as_on_any_system(tmp_path: Path, suffix: str, end: str):
+    path = tmp_path / f"a.{suffix}"
+    kind = {"stl": "stl_ascii"}.get(suffix, suffix)
+    BOX.export(path, file_type=kind, **({"encoding": "ascii"} if suffix == "ply" else {}))
+    path.write_bytes(path.read_text().replace("\n", end).encode())
+    assert_same_surface(read_geometry(path))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "off"])
+def test_a_mesh_of_text_may_be_in_utf_16(tmp_path: Path, suffix: str):
+    """As Windows' shell and its editor write text."""
+    path = tmp_path / f"a.{suffix}"
+    BOX.export(path, file_type={"stl": "stl_ascii"}.get(suffix, suffix))
+    path.write_text(path.read_text(), "utf-16")
+    assert_same_surface(read_geometry(path))
+
+
+def test_an_obj_may_be_in_capitals(tmp_path: Path):
+    BOX.export(tmp_path / "a.OBJ", file_type="obj")
+    (tmp_path / "a.OBJ").write_text((tmp_path / "a.OBJ").read_text().upper())
+    assert_same_surface(read_geometry(tmp_path / "a.OBJ"))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off"])
 def test_decimal_commas_of_a_mesh_are_named(tmp_path: Path, suffix: str):
     kind = {"stl": "stl_ascii"}.get(suffix, suffix)
     path = tmp_path / f"a.{suffix}"
@@ -1127,6 +1152,24 @@ def test_a_las_whose_header_does_not_count_all_points_is_refused(
     path.write_bytes(data)
     with pytest.raises(SceneError, match=f"its header counts {counted} points, and .* follow"):
         read_geometry(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"), [((b"a", b"a"), 9), ((b"intensity", b"X"), 9), ((b"H\xf6he", b"b"), 9), ((b"a", b"b"), 31)]
+)
+def test_extra_bytes_of_a_las_do_not_matter(tmp_path: Path, names: tuple[bytes, bytes], kind: int):
+    """Names twice, those of LAS itself, and in a code page; and types that are not known."""
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+    las.add_extra_dims([laspy.ExtraBytesParams(name=name, type="f4") for name in ("first", "second")])
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    las.write(str(tmp_path / "a.las"))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    for name, other in zip((b"first", b"second"), names, strict=True):
+        at = data.index(name.ljust(32, b"\0"))
+        data[at - 2], data[at : at + 32] = kind, other.ljust(32, b"\0")
+    (tmp_path / "a.las").write_bytes(data)
+    np.testing.assert_allclose(read_geometry(tmp_path / "a.las").vertices, POINTS, atol=0.006)
 
 
 def test_what_fills_up_a_las_is_no_point(tmp_path: Path):

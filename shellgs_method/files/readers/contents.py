@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import warnings
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 
 _WINDOWS_NAN = re.compile(r"[-+]?(1\.#[A-Z]+\d*|nan\([a-z]*\))", re.IGNORECASE)
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 NO_FACES = np.empty((0, 3), np.int64)
 
 
@@ -56,6 +58,13 @@ def splats(path: Path) -> SceneError:
 def drawing(path: Path) -> SceneError:
     """The refusal of a file of lines without faces, whose ends are no points of the surface between them."""
     return SceneError(f"the shell {path} is a drawing of lines, which have no surface: export its faces, or a scan")
+
+
+def encoding_of(path: Path) -> str:
+    """The encoding of a file of text: UTF-16, as programs on Windows write it too, if it begins with a mark of that."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    return next((name for bom, name in _BOMS.items() if start.startswith(bom)), "utf-8")
 
 
 def with_nan(line: str) -> str:

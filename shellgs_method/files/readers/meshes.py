@@ -14,6 +14,7 @@ from shellgs_method.files.readers.contents import (
     NO_POINTS,
     Geometry,
     drawing,
+    encoding_of,
     left_out,
     numbers_in,
     polygon_triangles,
@@ -30,17 +31,17 @@ def read_obj(path: Path) -> Geometry:
         SceneError: it holds lines only.
         Exception: it is damaged; of any kind.
     """
-    text = path.read_text("utf-8-sig", errors="replace").replace("\\\n", " ")
+    text = path.read_text(encoding_of(path), errors="replace").replace("\\\n", " ")
     vertices: list[str] = []
     faces: list[str] = []
     above: list[int] = []  # number of vertices before each face
     curved = lines = 0
     for line in map(str.lstrip, text.splitlines()):
-        key = line[:2].rstrip()
+        key = line[:2].rstrip().lower()
         if key == "v":
             vertices.append(line)
         elif key in ("f", "fo"):
-            faces.append(line.partition("#")[0].lstrip("fo"))
+            faces.append(line.partition("#")[0].lstrip("fFoO"))
             above.append(len(vertices))
         elif key == "l":
             lines += 1
@@ -61,7 +62,6 @@ def read_obj(path: Path) -> Geometry:
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _STL_START, _STL_PROBE = 84, 1 << 12  # bytes: the header's; in which a binary STL has a zero
 _UNCOUNTED = (0, 0xFFFFFFFF)
-_BOM = "ï»¿"  # UTF-8's, as Latin-1
 
 
 def read_stl(path: Path) -> Geometry:
@@ -72,10 +72,10 @@ def read_stl(path: Path) -> Geometry:
     Raises:
         ValueError: it is cut off or damaged.
     """
-    data = path.read_bytes()
-    if b"\0" in data[:_STL_PROBE]:  # text has none
+    data, encoding = path.read_bytes(), encoding_of(path)
+    if b"\0" in data[:_STL_PROBE] and encoding != "utf-16":  # other text has none
         return _binary_stl(path, data)
-    words = [line.split() for line in with_nan(data.decode("latin-1")).removeprefix(_BOM).lower().splitlines()]
+    words = [line.split() for line in with_nan(data.decode(encoding, errors="replace")).lower().splitlines()]
     solids, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "facet"))
     ends = sum("".join(line[:2]).startswith("endsolid") for line in words)  # end solid NAME, endsolidNAME
     if not solids:
@@ -111,7 +111,7 @@ def read_off(path: Path) -> Geometry:
         SceneError: it is binary, or has other than three coordinates.
         Exception: it is damaged; of any kind.
     """
-    text = re.sub(r"#.*", "", with_nan(path.read_text("utf-8-sig", errors="replace")))
+    text = re.sub(r"#.*", "", with_nan(path.read_text(encoding_of(path), errors="replace")))
     form, _, rest = text.lstrip().partition("OFF")
     if not re.fullmatch(r"(ST)?C?N?", form) or re.match(r"\s+BINARY", rest):
         raise SceneError(f"the shell {path} is no OFF of text with three coordinates: export it as PLY or OBJ")

@@ -29,7 +29,10 @@ BANDS = "colorRed", "colorGreen", "colorBlue"
 def read_las(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the points that are neither withheld nor noise, and whose coordinates are within the file's integers."""
     import laspy
+    from laspy.vlrs.known import ExtraBytesVlr
 
+    # Nobody reads the points' extra bytes, whose names may be twice there, or in a code page.
+    ExtraBytesVlr.type_of_extra_dims = lambda self: []
     read = beyond = 0
     with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
         for piece in file.chunk_iterator(PIECE):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
 import re
 from collections.abc import Iterator
@@ -13,12 +12,11 @@ from typing import TextIO
 import numpy as np
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import left_out, with_nan
+from shellgs_method.files.readers.contents import encoding_of, left_out, with_nan
 from shellgs_method.files.readers.points import NO_POINTS, PIECE, Points
 from shellgs_method.files.tables import COORDINATES, LATITUDE, LONGITUDE
 
 _COMMENTS = ("#", "//", "%")
-_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _SAMPLE = 100  # lines that decide on the layout
 _TIMED, _SECONDS = 10, 1000.0  # lines that show that a column rises, and what scanners' times are beyond
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
@@ -40,10 +38,7 @@ def read_text_cloud(path: Path) -> Iterator[Points]:
         SceneError: the first lines are no such columns.
         ValueError: a later line is not, or points are missing.
     """
-    with path.open("rb") as file:
-        start = file.read(4)
-    encoding = next((name for bom, name in _BOMS.items() if start.startswith(bom)), "utf-8")
-    with path.open(encoding=encoding, errors="replace") as file:
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
         lines = _Lines(file)
         first = list(islice(lines, _SAMPLE))
         if not first:
@@ -78,7 +73,7 @@ def read_ptx(path: Path) -> Iterator[Points]:
         ValueError: it is damaged, or cut off.
     """
     misses = total = 0
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
         lines = (with_nan(line) for line in file if line.strip())
         while size := next(lines, ""):
             rays = int(size) * int(next(lines, ""))
