@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import re
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import ZipFile
@@ -258,11 +259,10 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         SceneError: the system has heights in another unit than eastings, counts from the middle of the Earth, or is a
             projection of all of it; or a unit is given for a file that is read in metres.
     """
-    if in_metres := [path for path in shell if path.suffix.lower() in IN_METRES]:
-        if given != 1:
-            raise SceneError(
-                f"{in_metres[0]} is read in metres, whatever its unit is: leave --metres-per-shell-unit out"
-            )
+    in_metres = [path for path in shell if path.suffix.lower() in IN_METRES]
+    if given != 1 and (converted := [*in_metres, *filter(_is_in_degrees, shell)]):
+        raise SceneError(f"{converted[0]} is read in metres, whatever its unit is: leave --metres-per-shell-unit out")
+    if in_metres:
         return given
     crs = known_crs(system)
     if crs is None or not shell:
@@ -285,6 +285,13 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         return given
     notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken for {metres:.9g} m.")
     return metres
+
+
+def _is_in_degrees(path: Path) -> bool:
+    """Whether a file is a CityGML in degrees, which is read in metres."""
+    with suppress(OSError, ValueError):  # a missing or empty one is refused where it is read
+        return _IN_FILES.get(path.suffix.lower()) is _IN_GML and metres_of_degrees(path) is not None
+    return False
 
 
 def crs_there(system: str, place: Float64[np.ndarray, " 3"], metres: float) -> str:

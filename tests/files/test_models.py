@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.panels import supervision_panel
-from shellgs_method.files.crs import crs_of
+from shellgs_method.files.crs import crs_of, metres_of
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.files.surfaces import read_geometry
@@ -340,6 +340,14 @@ def test_a_citygml_in_degrees_is_read_in_metres(
     assert_cast_as(path, faces)
     assert crs_of(path) == metres
     assert f"is read in metres of {CRS(metres).name}." in caplog.text
+
+
+def test_a_unit_for_a_citygml_in_degrees_is_refused(tmp_path: Path):
+    path = tmp_path / "a.gml"
+    in_degrees(path, "EPSG:4937", [1, 0, 2], "EPSG:25832", (410_000, 5_413_000, 2))
+    assert metres_of("EPSG:25832", 1, [path]) == 1
+    with pytest.raises(SceneError, match=r"a.gml is read in metres, whatever its unit is: leave --metres-per-shell"):
+        metres_of("EPSG:25832", 0.3048, [path])
 
 
 def test_a_citygml_in_degrees_of_which_either_may_be_the_latitude_is_refused(tmp_path: Path):
