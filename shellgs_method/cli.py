@@ -26,7 +26,7 @@ from shellgs_method.commands.run import run
 from shellgs_method.commands.sim import sim
 from shellgs_method.commands.splats import splats
 from shellgs_method.commands.street import street
-from shellgs_method.errors import refusals_end_the_program
+from shellgs_method.errors import print_what_can_be, refusals_end_the_program
 
 COMMANDS = (
     demo,
@@ -51,6 +51,7 @@ COMMANDS = (
 
 def main() -> None:
     """Entry point."""
+    print_what_can_be()
     for category in (FutureWarning, SyntaxWarning):  # raised by dependencies, no use to a user
         warnings.filterwarnings("ignore", category=category)
     for command in COMMANDS:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from io import TextIOWrapper
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -17,6 +18,12 @@ log = logging.getLogger(__name__)
 
 INTERRUPTED = 130
 """What a shell expects of a command that Ctrl-C ended."""
+
+
+def print_what_can_be() -> None:
+    """Let question marks stand for what stdout cannot encode, as lines of tables on Windows, where it is a file."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 class SceneError(ValueError):

@@ -256,6 +256,15 @@ def test_a_table_in_a_narrow_terminal_has_all_of_a_path():
     assert path in "".join(line.split("│")[2].strip() for line in output.getvalue().splitlines() if "│" in line)
 
 
+@pytest.mark.parametrize("code", ["from shellgs_method import cli; cli.main()", "import dataparsers; print('✓ ─')"])
+def test_output_of_any_encoding_is_printed(code):
+    """As of a file on Windows; nerfstudio's commands import the parser before they print their lines."""
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run([sys.executable, "-c", code, "doctor"], env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+    assert b"? " in done.stdout
+
+
 def test_doctor_names_the_kind_of_an_error_without_words(monkeypatch):
     def fail(*_) -> None:
         raise ImportError
