@@ -17,7 +17,7 @@ from shellgs_method.errors import SceneError, notice
 
 if TYPE_CHECKING:  # training needs no PROJ
     from laspy import LasHeader
-    from pyproj import CRS
+    from pyproj import CRS, Transformer
 
 IN_METRES = (".ifc", ".ifczip")
 """Suffixes of files that are read in metres, whatever their system."""
@@ -63,6 +63,8 @@ _HEIGHTS = {9001: 5703, 9002: 8228, 9003: 6360}
 """Some system of heights in each unit, by EPSG: metres, feet, US survey feet."""
 _SITE = 1e4
 """Metres from the origin of its numbers, within which a shell may have been moved there."""
+_EXACT = 1.0
+"""Metres to which conversions are known that nobody does better."""
 _BEYOND = 5.0
 """Degrees beyond the area of a system up to which it is used."""
 
@@ -329,16 +331,37 @@ def _is_of_the_earth(crs: CRS) -> bool:
 
 def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:
     """Conversion of coordinates, x (or longitude) first, from one system to another; infinite where there is none."""
+    return _conversion(source, target)[0]
+
+
+def _conversion(
+    source: CRS, target: CRS
+) -> tuple[Callable[[np.ndarray], Float64[np.ndarray, "N D"]], Transformer | None]:
+    """The conversion, and what of PROJ it is by; None where that does nothing."""
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
-    if source.to_2d() == target.to_2d() and len(source.axis_info) <= len(target.axis_info):
-        return lambda points: points
+    if source == target or (source.to_2d() == target.to_2d() and len(source.axis_info) == 2):
+        return lambda points: points, None
     try:
         transformer = Transformer.from_crs(source, target, always_xy=True)
     except ProjError:  # to or from a local system
-        return lambda points: np.full(points.shape, np.inf)
-    return lambda points: np.stack(transformer.transform(*points.T), axis=-1)
+        return lambda points: np.full(points.shape, np.inf), None
+    both = len(source.axis_info) == len(target.axis_info) == 3
+    heights = 1.0 if both else _metres_of_heights(source) / _metres_of_heights(target)  # which PROJ leaves otherwise
+
+    def convert(points: np.ndarray) -> Float64[np.ndarray, "N D"]:
+        x, y, *z = transformer.transform(*points.T)
+        return np.stack([x, y, *(heights * each for each in z)], axis=-1)
+
+    return convert, transformer
+
+
+def _metres_of_heights(crs: CRS) -> float:
+    """Metres of the unit of a system's heights: of eastings', or of metres beside degrees, where it says none."""
+    if len(crs.axis_info) > 2:
+        return crs.axis_info[2].unit_conversion_factor
+    return 1.0 if crs.is_geographic else crs.axis_info[0].unit_conversion_factor
 
 
 def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
@@ -355,7 +378,7 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
     from pyproj import CRS
 
     wanted = CRS.from_user_input(target)
-    convert = conversion(source, wanted)
+    convert, transformer = _conversion(source, wanted)
 
     def checked(points: np.ndarray) -> Float64[np.ndarray, "N 3"]:
         converted = convert(points)
@@ -371,9 +394,28 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
                 f"{where}: {_words(first)} cannot be converted from {source.name} to {wanted.name}: "
                 + ("that is local" if wanted.is_engineering else "is the longitude first?")
             )
+        if transformer is not None and len(points):
+            _tell_of_accuracy(transformer, f"{where}: converted to {wanted.name}")
         return converted
 
     return checked
+
+
+def _tell_of_accuracy(operation: Transformer, what: str) -> None:
+    """Tell the user of a conversion that is metres off: PROJ has no grid for it here, or nobody knows better."""
+    from pyproj.exceptions import ProjError
+
+    with suppress(ProjError):  # it had no choice of operations
+        operation = operation.get_last_used_operation()
+    better = "with PROJ_NETWORK=ON it fetches what there is"
+    if "ballpark vertical" in operation.description.lower():
+        notice(
+            f"{what}, but not their heights, for which PROJ has no grid here: between the ellipsoid and the sea there "
+            f"are up to 100 m; {better}."
+        )
+    elif not 0 <= operation.accuracy <= _EXACT:
+        known = f"to {operation.accuracy:g} m" if operation.accuracy > 0 else "without a known accuracy"
+        notice(f"{what} {known}, as far as PROJ knows here, by which all of them may be off together; {better}.")
 
 
 def _within(crs: CRS, degrees: np.ndarray, beyond: float = 0.0) -> Bool[np.ndarray, " N"]:

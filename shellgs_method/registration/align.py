@@ -24,7 +24,7 @@ from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
-from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
@@ -343,8 +343,11 @@ def up_in_words(alignment: Alignment) -> str:
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
     """How a placement puts the shell elsewhere, or makes it larger or smaller, than what cameras see; None if not."""
+    alignment = placement.alignment
     seen = np.concatenate([points.positions, positions(view.camera for view in views)])
-    return apart(transformed(mesh.vertices, placement.alignment.shell_to_scene), seen)
+    shell = transformed(mesh.vertices, alignment.shell_to_scene)
+    up = alignment.rotation @ usual_up(alignment.shells)
+    return apart(shell, seen) or heights_apart(shell, points.positions, up, alignment.metres_per_unit)
 
 
 def refined(

@@ -25,6 +25,7 @@ _NARROW, _WIDE = 0.005, 0.05  # extent of either, below which they may be in ano
 _SURELY = 0.5  # of these, once a slip is corrected
 # Sizes of the shell relative to what the cameras see, which is a part of a building, or more than that:
 _LARGEST = 20.0
+_OFF_HEIGHT = 5.0  # metres between a shell and what cameras see, below which other causes are likelier than heights'
 _FEW = 3  # points, fewer of which say nothing of their unit
 
 
@@ -135,6 +136,32 @@ def apart(shell: Float64[np.ndarray, "V 3"], seen: Float64[np.ndarray, "N 3"]) -
             "shift (such as CloudCompare's --global-shift) is missing, or has the other sign"
         )
     return None
+
+
+def heights_apart(
+    shell: Float64[np.ndarray, "V 3"],
+    points: Float64[np.ndarray, "N 3"],
+    up: Float64[np.ndarray, " 3"],
+    metres: float,
+) -> str | None:
+    """That a shell is right above or below what the cameras see, in words; None if it is not.
+
+    Args:
+        shell: vertices of the shell, placed in the scene's frame by an alignment.
+        points: SfM points, in the same frame.
+        up: the shell's direction upwards there.
+        metres: metres of the frame's unit.
+    """
+    upright = np.stack([*np.linalg.svd(up[None])[2][1:], up])
+    (low, high), (bottom, top) = _box(shell @ upright.T), _box(points @ upright.T)
+    gap = np.maximum(low - top, 0) - np.maximum(bottom - high, 0)
+    if gap[:2].any() or metres * abs(gap[2]) < _OFF_HEIGHT:
+        return None
+    off = metres * float((low + high - bottom - top)[2]) / 2
+    return (
+        f"it puts the shell some {abs(off):.0f} m {'above' if off > 0 else 'below'} what the cameras see: heights of "
+        "the one may be above the ellipsoid, as GNSS measures them, and of the other above the sea: convert one of them"
+    )
 
 
 def _spread(surface: Geometry | Cloud) -> Float64[np.ndarray, "N 3"]:

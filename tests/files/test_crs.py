@@ -252,6 +252,35 @@ def test_nothing_is_converted_to_a_local_system():
         convert(np.array([[8.4, 49.0, 100.0]]))
 
 
+@pytest.mark.parametrize("source", ["EPSG:4326", "EPSG:4979", "EPSG:32618", "EPSG:2263", "EPSG:2263+5703"])
+@pytest.mark.parametrize("target", ["EPSG:2263", "EPSG:2263+6360", "EPSG:32618"])
+def test_heights_are_converted_to_the_unit_of_the_system(source, target):
+    """PROJ leaves them as they are where either of the systems has none: those of GNSS were metres among feet."""
+    known = {"EPSG:4326": (-74, 40.7), "EPSG:4979": (-74, 40.7), "EPSG:32618": (584482.353, 4505935.766)}
+    x, y = known.get(source, (984250.0, 194305.339))
+    in_feet = {"EPSG:2263", "EPSG:2263+6360"}
+    height = 30.0 / 0.3048006 if source in in_feet else 30.0
+    (found,) = converter(pyproj.CRS(source), target, "picks")(np.array([[x, y, height]]))
+    assert found[2] == pytest.approx(30.0 / 0.3048006 if target in in_feet else 30.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "place", "why"),
+    [
+        ("EPSG:4326", "EPSG:31467", (8.5, 49), ": converted to DHDN / 3-degree Gauss-Kruger zone 3 to 3 m,"),
+        ("EPSG:4979", "EPSG:25832+7837", (8.5, 49), "but not their heights, for which PROJ has no grid here"),
+        ("EPSG:4326", "EPSG:25832", (8.5, 49), ""),
+        ("EPSG:25833", "EPSG:25832", (500000, 5400000), ""),
+        ("EPSG:4326+5773", "EPSG:25832+7837", (8.5, 49), "but not their heights"),
+        ("EPSG:25832+5773", "EPSG:25832+7837", (500000, 5400000), "but not their heights"),
+    ],
+)
+def test_conversions_that_are_metres_off_are_told(caplog, source, target, place, why):
+    """PROJ takes the best that it has, and does not say that a grid is missing."""
+    converter(pyproj.CRS(source), target, f"picks in {source}")(np.array([[*place, 100.0]]))
+    assert caplog.text.count(why) if why else not caplog.text
+
+
 def test_polar_systems_have_lengths():
     assert metres_of("EPSG:3031", 1.0, (Path("scan.las"),)) == 1
 

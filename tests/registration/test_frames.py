@@ -17,7 +17,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.geometry.camera import in_view
-from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
 from shellgs_method.registration.sfm_frame import _Sight, check_points, in_degrees, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
@@ -322,6 +322,22 @@ def test_an_alignment_that_puts_the_shell_elsewhere_is_described():
     assert apart(np.add(seen, [60.0, 0, 0]), seen) is None  # a house across the street
     assert "look for another unit" in (apart(1000 * seen, seen) or "")
     assert "look for another unit" in (apart(seen / 1000, seen) or "")
+
+
+def test_heights_above_the_ellipsoid_are_named_where_others_are_above_the_sea():
+    rng = np.random.default_rng(0)
+    seen = rng.uniform([0, 0, 0], [20, 2, 8], (500, 3))
+    scene = Rotation.from_euler("xyz", [70, 20, 30], degrees=True)  # whatever the axes of structure from motion
+    up = scene.apply([0, 0, 1.0])
+
+    def words(*shift: float) -> str | None:
+        return heights_apart(scene.apply(np.add(seen, shift)) / 2, scene.apply(seen) / 2, up, metres=2.0)
+
+    assert "some 48 m below what the cameras see" in (words(0, 0, -48) or "")
+    assert "some 30 m above what the cameras see" in (words(5, 0, 30) or "")
+    assert words(0, 0, 6) is None  # a part of it is at their height
+    assert words(0, 30, 30) is None  # it is elsewhere, too
+    assert words(0, 3, 0) is None
 
 
 def test_a_matrix_without_its_global_shift_is_refused_with_the_distance(scene, shellgs):
