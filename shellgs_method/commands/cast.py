@@ -31,6 +31,8 @@ HOLES = 0.01
 """Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
 GLASS = 0.01
 """Share of the shell behind which photographs agree on something, above which it is hardly all panes of glass."""
+SINGLE = 0.1
+"""Share of the photographs, or two, that are displaced by cameras of their own, and not by the shell's place."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
@@ -232,10 +234,12 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     )
     if displaced := read_displaced(scene):
         name, (right, down) = next(iter(displaced.items()))
+        few = "Their cameras are wrong, or are those of other photographs: leave them out, or find their cameras again."
+        many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
         console.print(
             "Photographs that do not show the building where the others and their own cameras put it: "
-            f"{len(displaced)}, {name} by {math.hypot(right, down):.0f} pixels, for example. Their cameras are wrong, "
-            "or are those of other photographs: leave them out, or find their cameras again.",
+            f"{len(displaced)}, {name} by {math.hypot(right, down):.0f} pixels, for example. "
+            f"{few if len(displaced) <= max(2, SINGLE * len(views)) else many}",
             style="yellow",
         )
     verdicts = shell_verdicts(scene, views)

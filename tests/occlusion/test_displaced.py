@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from shellgs_method import occlusion
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.occlusion import read_displaced
 from shellgs_method.occlusion.displaced import displacements
@@ -87,3 +88,14 @@ def test_photographs_of_other_poses_are_told_until_they_are_left_out(shellgs, sc
         told = " ".join(shellgs("cast", scene).split())
         assert set(read_displaced(scene)) == {f"images/{first.name}", f"images/{other.name}"}
         assert "their own cameras put it: 2, images/" in told
+        assert "leave them out" in told
+
+
+def test_of_many_displaced_photographs_the_shell_is_told(shellgs, scene: Path, monkeypatch):
+    monkeypatch.setattr(occlusion, "read_displaced", lambda scene: {f"images/{k}.png": (9, 0) for k in range(3)})
+    assert "the shell may not stand where it is built" in " ".join(shellgs("cast", scene).split())
+
+
+def test_a_wrong_depth_of_the_surface_displaces_photographs_from_the_side():
+    views = [view._replace(depth=view.depth - 1.5) for view in row()]
+    assert (np.abs(displacements(views, ALL)).max(axis=1) > 0).sum() > 2
