@@ -30,8 +30,9 @@ class FacadeDataset(InputDataset):
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. ``other_depth`` is the depth of what photographs show in front of the shell, or behind
     it, in windows, else 0; ``transient`` is true where only this one shows something in front of it, ``beyond`` where
-    they show the background, ``doubtful`` where there may be something in front of it. With ``part``, masks keep only
-    pixels whose wall lies in it. With ``covisibility``, ``seen`` is true where training views show what a pixel shows.
+    they show the background, or what is behind a wall, ``doubtful`` where there may be something in front of it. With
+    ``part``, masks keep only pixels whose wall lies in it. With ``covisibility``, ``seen`` is true where training views
+    show what a pixel shows.
     ``kinds`` are the maps to read, all if not set; with ``any_size`` they are resampled where their size differs, as
     they are if ``scale_factor`` is not 1.
     """
@@ -110,9 +111,10 @@ class FacadeDataset(InputDataset):
         maps = {}
         checked = self.sets.get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
-            occluder, maps["transient"], maps["beyond"], _, behind, maps["doubtful"] = (
+            occluder, maps["transient"], background, unbuilt, _, behind, maps["doubtful"] = (
                 torch.from_numpy(mask & inside)[..., None] for mask in Findings.of(found, cues["shell"])
             )
+            maps["beyond"] = background | unbuilt
             maps["other_depth"] = self._rescaled_depth(found).where(occluder | behind, 0.0)
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)

@@ -21,6 +21,7 @@ FINDINGS = (
     ("in front of the shell", "r", 0.7),
     ("moved", "b", 0.7),
     ("background", "y", 0.7),
+    ("behind a wall", "orange", 0.7),
     ("shell confirmed", "g", 0.25),
     ("behind the shell", "m", 0.5),
     ("shell doubted", "c", 0.4),

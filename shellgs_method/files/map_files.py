@@ -125,8 +125,10 @@ class Findings(NamedTuple):
     """Something stands in front of the shell."""
     moved: Bool[np.ndarray, "H W"]
     """Only this view's photograph shows something in front of it."""
-    beyond: Bool[np.ndarray, "H W"]
-    """The background, or a part of the building behind a wall of the model: the shell is larger than the building."""
+    background: Bool[np.ndarray, "H W"]
+    """The background: the shell is larger than the building."""
+    unbuilt: Bool[np.ndarray, "H W"]
+    """Something behind a wall of a model that knows its windows: the wall is not there."""
     confirmed: Bool[np.ndarray, "H W"]
     """The shell."""
     behind: Bool[np.ndarray, "H W"]
@@ -144,10 +146,12 @@ class Findings(NamedTuple):
         depth of what a window shows, or that much less where doubtful, the depth of what may be there.
         """
         nearer, farther = checked.depth < 0.995 * shell.depth, checked.depth > 1.005 * shell.depth
+        far = checked.depth > 0.9 * BACKGROUND * shell.depth
         hidden = checked.mask
         shown = ~hidden & (checked.depth > 0)
         same = ~nearer & ~farther
-        return cls(hidden & nearer, hidden & same, hidden & farther, shown & same, shown & farther, shown & nearer)
+        not_there = hidden & far, hidden & farther & ~far
+        return cls(hidden & nearer, hidden & same, *not_there, shown & same, shown & farther, shown & nearer)
 
 
 def resampled(cue: CueMap, camera: Camera) -> CueMap:

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.cue_maps import CueMaps, Findings
-from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -138,8 +137,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
         solid = True if cue.classes is None else cue.classes != SurfaceClass.WINDOW
-        back = (found.behind | found.beyond) & (check.depth < 0.9 * BACKGROUND * cue.depth)  # not the sky at its edges
-        farther[k] = visible & (back & solid)[rows, columns]
+        farther[k] = visible & ((found.behind | found.unbuilt) & solid)[rows, columns]
     median = np.full(len(places), np.nan)
     some = np.isfinite(distances).any(axis=0)
     median[some] = np.nanmedian(distances[:, some], axis=0)

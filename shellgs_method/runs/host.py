@@ -179,18 +179,11 @@ def _mend_exporter(exporter: Any) -> None:
 
 def _mend_viewer(run_viewer: Any) -> None:
     """Ns-viewer has an address of its own, and Ctrl-C, which is its only end, is no bug."""
-    start = run_viewer._start_viewer
-    if hasattr(start, "__wrapped__"):
-        return
 
-    @wraps(start)
-    def checked(config: Any, *rest: Any) -> None:
-        with refusals_end_the_program():
-            check_viewer(config.viewer)
-        with suppress(KeyboardInterrupt):
-            start(config, *rest)
+    def check(config: Any, *_rest: Any) -> None:
+        check_viewer(config.viewer)
 
-    run_viewer._start_viewer = checked
+    run_viewer._start_viewer = _before(run_viewer._start_viewer, check, KeyboardInterrupt)
 
 
 def _running(kind: type) -> Any:
@@ -211,8 +204,8 @@ _MENDS = {
 }
 
 
-def _before(function: Callable, check: Callable) -> Callable:
-    """The function, once, after a check of its arguments that may end the program."""
+def _before(function: Callable, check: Callable, *ends: type[BaseException]) -> Callable:
+    """The function, once, after a check of its arguments that may end the program; some exceptions only end it."""
     if hasattr(function, "__wrapped__"):
         return function
 
@@ -220,6 +213,7 @@ def _before(function: Callable, check: Callable) -> Callable:
     def checked(*args: Any, **kwargs: Any) -> Any:
         with refusals_end_the_program():
             check(*args, **kwargs)
-        return function(*args, **kwargs)
+        with suppress(*ends):
+            return function(*args, **kwargs)
 
     return checked

@@ -508,7 +508,7 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
     inside[sky] = False
     for view in views:
         found = Findings.of(checked.require(view.name, view.camera), shell.require(view.name, view.camera))
-        assert (found.beyond == ((wall > 0) & ~inside)).mean() > 0.99
+        assert (found.background == ((wall > 0) & ~inside)).mean() > 0.99
         assert not (found.occluder | found.moved)[sky].any()
         assert found.occluder.mean() < 0.01
 
@@ -558,16 +558,16 @@ def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Pat
     assert found.behind[windows[MIDDLE]].mean() > 0.5
     wall = ~windows[MIDDLE]
     assert found.behind[wall].any() != known
-    assert found.beyond[wall].any() == known
-    assert not (found.beyond & windows[MIDDLE]).any()
+    assert found.unbuilt[wall].any() == known
+    assert not (found.unbuilt & windows[MIDDLE]).any()
 
 
 def test_a_checked_map_says_what_a_pixel_shows():
-    shell = np.full((1, 7), 8, np.float32)
-    depth, hidden = np.array([[5, 8, 16, 8, 16, 5, 0]], np.float32), np.array([[True] * 3 + [False] * 4])
-    normal = np.zeros((1, 7, 3), np.float16)
+    shell = np.full((1, 8), 8, np.float32)
+    depth, hidden = np.array([[5, 8, 80, 16, 8, 16, 5, 0]], np.float32), np.array([[True] * 4 + [False] * 4])
+    normal = np.zeros((1, 8, 3), np.float16)
     found = Findings.of(CueMap(depth, normal, hidden), CueMap(shell, normal, shell > 0))
-    assert [mask[0].tolist() for mask in found] == np.eye(6, 7, dtype=bool).tolist()
+    assert [mask[0].tolist() for mask in found] == np.eye(7, 8, dtype=bool).tolist()
 
 
 @pytest.mark.parametrize("change", ["another split", "another photograph"])
