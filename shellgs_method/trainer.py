@@ -114,6 +114,14 @@ class FacadeTrainerConfig(TrainerConfig):
     def __post_init__(self) -> None:
         check_settings(self)
 
+    def set_experiment_name(self) -> None:
+        """Name runs after their scene's folder, as it is called: nerfstudio cuts off what follows a dot, and of a scene
+        given as ``..`` runs were beside the output folder.
+        """
+        if self.experiment_name is None and (scene := self.pipeline.datamanager.data) is not None:
+            self.experiment_name = Path(os.path.abspath(scene)).name
+        super().set_experiment_name()
+
     def save_config(self) -> None:
         """Save the config to the run's folder, whole or not at all; ns-train does it before anything else."""
         with refusals_end_the_program():

@@ -50,6 +50,19 @@ def scene_of(config: TrainerConfig) -> Path:
 # The folder
 
 
+@pytest.mark.parametrize(
+    ("data", "name"), [(".", "house.2"), ("..", "here"), ("house.1", "house.1"), ("../other/", "other")]
+)
+def test_a_run_is_named_after_the_whole_name_of_its_scene(tmp_path, monkeypatch, data, name):
+    """Runs of house.1 and house.2 were in one folder, and those of .. beside the output folder."""
+    here = tmp_path / "here" / "house.2"
+    here.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    config = copy.deepcopy(all_methods["photo-gs"])
+    config.timestamp, config.pipeline.datamanager.data = "run", Path(data)
+    assert config.get_base_dir() == Path("outputs", name, "photo-gs", "run")
+
+
 PLACES: dict[str, Callable[[Path], object]] = {
     "where it was trained": lambda _: None,
     "a copy beside it": lambda run: shutil.copytree(run, run.with_name("copy")),
