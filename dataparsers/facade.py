@@ -32,6 +32,8 @@ from shellgs_method.registration.sfm_frame import check_points
 
 ROUNDING = 1e-6
 """Harmless rounding of positions to float32, as a share of the cameras' spread."""
+TAKEN_OUT = 0.25
+"""Share of the photographs that a user may have taken out of their folder: it is another one if more are missing."""
 
 
 @dataclass
@@ -93,8 +95,10 @@ class FacadeDataParser(DataParser):
         whole = _of_split(recording, split, config)
         chosen, cell = _of_block(recording, whole, split, config)
         used = chosen if config.block else range(len(recording.frames))
-        _refuse_missing_images([recording.frames[k] for k in used], config.data)
-        views = _views(recording.frames, config)
+        there = _on_disk(recording.frames, used, config.data)
+        if not (chosen := [k for k in chosen if k in there]):
+            raise FileNotFoundError(f"none of the photographs of {config.data} for {split} is on disk: put some back.")
+        views = dict(zip(there, _views([recording.frames[k] for k in there], config), strict=True))
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)
         if split == "train":
@@ -131,8 +135,7 @@ class FacadeDataParser(DataParser):
 def read_views(layout: SceneLayout) -> list[View]:
     """All views of a scene at full size, training and held-out, sorted by name."""
     frames = layout.read().frames
-    _refuse_missing_images(frames, layout.data)
-    return _views(frames, layout)
+    return _views([frames[k] for k in _on_disk(frames, range(len(frames)), layout.data)], layout)
 
 
 def held_out_names(config: FacadeDataParserConfig) -> set[str]:
@@ -286,14 +289,19 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     return cells
 
 
-def _refuse_missing_images(frames: Sequence[Frame], scene: Path) -> None:
-    missing = [frame.name for frame in frames if not frame.image.is_file()]
+def _on_disk(frames: Sequence[Frame], used: Sequence[int], scene: Path) -> list[int]:
+    """Indices of those photographs that are there: a user may take those with wrong cameras out of their folder."""
+    there = [k for k in used if frames[k].image.is_file()]
+    missing = [frames[k].name for k in sorted({*used} - {*there})]
     if missing:
         shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
-        raise FileNotFoundError(
-            f"{len(missing)} of {len(frames)} images of the cameras in {scene} are not on disk ({shown}); "
-            "put them back, take them out of the model, or name their folder with --images-path."
-        )
+        what = f"{len(missing)} of {len(used)} images of the cameras in {scene} are not on disk"
+        if len(missing) > max(1, TAKEN_OUT * len(used)):
+            raise FileNotFoundError(
+                f"{what} ({shown}); put them back, take them out of the model, or name their folder with --images-path."
+            )
+        notice(f"{what}, and are left out: {shown}.")
+    return there
 
 
 FacadeDataParserSpecification = DataParserSpecification(

@@ -167,11 +167,10 @@ def are_far(cameras: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
 
 def _tell_of_far(frames: Sequence[Frame], where: str) -> None:
     far = are_far(positions([frame.camera for frame in frames]))
-    if far.any():
-        name = next(frame.name for frame, is_far in zip(frames, far, strict=True) if is_far)
+    if names := [frame.name for frame, away in zip(frames, far, strict=True) if away and frame.image.is_file()]:
         notice(
-            f"{where} has {far.sum()} of {len(frames)} cameras far from all others, that of {name} for example, as "
-            "where structure from motion went wrong: leave these photographs out, unless they were taken from there."
+            f"{where} has {len(names)} of {len(frames)} cameras far from all others, that of {names[0]} for example, "
+            "as where structure from motion went wrong: move these photographs away, unless they were taken from there."
         )
 
 

@@ -142,8 +142,10 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "an absolute path": (lambda scene: change(scene, 3, file_path="/etc/passwd"), "'/etc/passwd', which is not"),
     "a path of two lines": (lambda scene: change(scene, 3, file_path="images/a\nb.png"), "is not inside the scene"),
     "a path of nothing": (lambda scene: change(scene, 3, file_path=""), "'', which is not inside"),
-    "a photograph that is a folder": (lambda scene: change(scene, 3, file_path="images"), "not on disk (images)"),
-    "no photograph": (lambda scene: change(scene, 3, file_path="images/x.png"), "1 of 10 images"),
+    "three photographs that are none": (
+        lambda scene: [change(scene, k, file_path=path) for k, path in enumerate(("images", "images/x.png", "y.png"))],
+        "3 of 10 images of the cameras",
+    ),
     "a mask out of the scene": (lambda scene: change(scene, 3, mask_path="../m.png"), "is not inside the scene"),
     "no mask": (lambda scene: change(scene, 3, mask_path="m.png"), "1 masks of"),
     "a transform of words": (lambda scene: change(scene, None, applied_transform="up"), "its applied_transform is not"),

@@ -88,7 +88,7 @@ def test_photographs_of_other_poses_are_told_until_they_are_left_out(shellgs, sc
         told = " ".join(shellgs("cast", scene).split())
         assert set(read_displaced(scene)) == {f"images/{first.name}", f"images/{other.name}"}
         assert "their own cameras put it: 2, images/" in told
-        assert "leave them out" in told
+        assert "move them away" in told
 
 
 def test_of_many_displaced_photographs_the_shell_is_told(shellgs, scene: Path, monkeypatch):
