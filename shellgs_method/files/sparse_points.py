@@ -21,6 +21,8 @@ STACKED = 4
 """Points in one place whose Gaussians would begin without a width, as that is the distance of the three nearest; two,
 which COLMAP makes of a feature with two orientations, do no harm."""
 
+_ROUNDED = 1e-6  # of the points' extent, by which places are the same
+
 
 @dataclass(frozen=True)
 class SparsePoints:
@@ -117,20 +119,29 @@ def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np
             f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "
             "and are left out."
         )
-    again = _again(positions)
+    again = _again(positions[near])
     if again.any():
         notice(
             f"{again.sum()} of {len(positions)} SfM points of {layout.data} are where others are, as the corners of a "
             "mesh's triangles, and are left out."
         )
-    return np.flatnonzero(near & ~again)
+    return np.flatnonzero(near)[~again]
 
 
 def _again(positions: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Which points are where at least three others are, but for the first of these."""
-    order = np.lexsort(positions.T)  # which keeps the order of equals
-    first = np.append(True, (positions[order[1:]] != positions[order[:-1]]).any(axis=1))[: len(order)]
-    place = np.cumsum(first) - 1
+    """Which points are where at least three others are, but for rounding, except for the first of these."""
     again = np.zeros(len(positions), bool)
-    again[order] = ~first & (np.bincount(place)[place] >= STACKED if len(place) else first)
+    cell = _ROUNDED * float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
+    for shift in (0.0, 0.5):  # a place may lie across the borders of cells
+        left = np.flatnonzero(~again)
+        again[left] = _repeated(np.floor(positions[left] / (cell or 1.0) + shift))
     return again
+
+
+def _repeated(cells: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    order = np.lexsort(cells.T)  # which keeps the order of equals
+    first = np.append(True, (cells[order[1:]] != cells[order[:-1]]).any(axis=1))[: len(order)]
+    place = np.cumsum(first) - 1
+    repeated = np.zeros(len(cells), bool)
+    repeated[order] = ~first & (np.bincount(place)[place] >= STACKED if len(place) else first)
+    return repeated

@@ -54,6 +54,7 @@ intensities in grey, 5 and more for those in colours and for classes."""
 # wrong frame it is 0.35 at most, though cameras often see most of them (three scenes, ten wrong frames of each).
 _SEEN, _ALIKE = 0.5, 0.4
 _UNSEEN, _HARDLY, _WELL, _UNLIKE = 0.02, 0.1, 0.8, 0.15
+_SPECK = 1e-4  # of the extent of the cameras, which is nothing that could be trained on
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
 
 
@@ -161,11 +162,18 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
         views: photographs of the scene, of any size.
 
     Raises:
-        SceneError: no camera sees them, or they would fit with other axes or in another unit, or other poses would.
+        SceneError: no camera sees them, or they would fit with other axes or in another unit, or other poses would; or
+            all are in one place.
     """
     if len(points.positions) < _FEW or not views:
         return
     sight = _Sight.of(points, views)
+    wide, apart = (float(np.ptp(each, axis=0).max()) for each in (points.positions, positions(sight.cameras)))
+    if wide < _SPECK * apart:
+        raise SceneError(
+            f"{points.called} are all in one place, {wide:.2g} wide, while the cameras are {apart:.2g} apart: export "
+            "cameras and points from one program, in one frame"
+        )
     seen, alike, away = sight.seen(sight.points), sight.alike(sight.points), sight.away(sight.points)
     if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE:
         return
