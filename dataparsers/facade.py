@@ -22,7 +22,7 @@ from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.frames import Frame, Recording, are_far
 from shellgs_method.files.paths import copies_among
-from shellgs_method.files.photographs import View, tell_of_other_sizes
+from shellgs_method.files.photographs import View, not_enlarged, tell_of_other_sizes
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
@@ -164,7 +164,7 @@ def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
         views.append(View(frame.name, frame.image, camera, lens, masks.get(frame.name)))
     views = oriented(views, layout)
     tell_of_other_sizes(views, layout.data)
-    return views
+    return [not_enlarged(view) for view in views]
 
 
 def _rescaled(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -180,6 +180,16 @@ def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
             f"{width}x{height} pixels, its camera {of}. They are scaled, which is wrong if these are undistorted "
             "cameras with the original photographs, or the other way round: both must be of one set."
         )
+
+
+def not_enlarged(view: View) -> View:
+    """The view at the size of its photograph, where that is smaller than its camera, as in ``images_4``."""
+    with suppress(SceneError, FileNotFoundError):  # as above
+        across, down = _calibrated_per_stored(view)
+        if min(across, down) > 1 + _SCALED:
+            camera = view.camera
+            return replace(view, camera=camera.resized(round(camera.width / across), round(camera.height / down)))
+    return view
 
 
 def load_upright(view: View) -> Image.Image:

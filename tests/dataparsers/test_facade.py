@@ -26,7 +26,7 @@ from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
 from shellgs_method.files.frames import are_far
-from shellgs_method.files.photographs import load_photograph
+from shellgs_method.files.photographs import from_camera, load_photograph, to_camera
 from shellgs_method.files.sparse_points import find_sparse_points, read_sparse_points
 from shellgs_method.files.splats import Splats, write_splats
 from shellgs_method.geometry.camera import OPENGL, Camera, image_up
@@ -178,8 +178,9 @@ def test_an_angle_of_view_is_a_focal_length(scene, smaller):
     size = {"w": meta["w"], "h": meta["h"]} if smaller else {}
     path.write_text(json.dumps({"camera_angle_x": angle, **size, "frames": frames}))
     for view, same in zip(read_views(FacadeDataParserConfig(data=scene)), before, strict=True):
-        assert (view.name, view.camera.width, view.camera.height) == (same.name, same.camera.width, same.camera.height)
-        torch.testing.assert_close(view.camera.K, same.camera.K)
+        camera = same.camera.scaled(0.5) if smaller else same.camera
+        assert (view.name, view.camera.width, view.camera.height) == (same.name, camera.width, camera.height)
+        torch.testing.assert_close(view.camera.K, camera.K)
 
 
 def test_points_without_colours_are_grey(scene):
@@ -439,6 +440,26 @@ def test_images_and_cameras_shrink_together(pristine_scene):
     views = [v for v in parse(pristine_scene, max_image_size=24).metadata["views"]]
     assert load_photograph(views[0]).shape == (16, 24, 3)
     assert (views[0].camera.width, views[0].camera.height) == (24, 16)
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.05])
+def test_photographs_smaller_than_their_cameras_are_not_enlarged(scene, k1):
+    """As those of ``--images-path images_4``: each pixel was trained on as a block of 16."""
+    before = parse(scene).metadata["views"][0]
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    path.write_text(
+        json.dumps(meta | {key: 4 * meta[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")} | {"k1": k1})
+    )
+    view = parse(scene).metadata["views"][0]
+    assert load_photograph(view).shape[:2] == (view.camera.height, view.camera.width)
+    if k1:
+        assert 40 <= view.camera.width <= 48
+    else:
+        torch.testing.assert_close(view.camera.K, before.camera.K)
+        np.testing.assert_array_equal(load_photograph(view), load_photograph(before))
+    pixels = np.array([[3.0, 5.0], [40.0, 20.0]])
+    np.testing.assert_allclose(from_camera(view, to_camera(view, pixels)), pixels, atol=1e-3)
 
 
 @pytest.mark.parametrize(("factor", "width", "height"), [(0.5, 24, 16), (0.4, 19, 13)])

@@ -67,6 +67,7 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     depth = caster.triangles.cast_rays(rays).t
     shade = np.where(np.isfinite(depth), 40 + 200 * np.clip(depth / 25, 0, 1), 0).astype(np.uint8)
     Image.fromarray(np.repeat(shade[..., None], 3, axis=2)).save(view.image)
+    view = read_views(FacadeDataParserConfig(data=scene))[4]  # whose size is that of its photograph
     photograph = load_photograph(view)[..., 0].astype(float)
     cue = caster.cast(view.camera)
     assert photograph.shape == cue.mask.shape
