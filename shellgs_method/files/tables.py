@@ -86,6 +86,7 @@ class Table:
             text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
+        text = re.sub(r'^"?sep=."?$', "", text, count=1, flags=re.MULTILINE)  # Excel's hint to itself
         tabbed = (
             line for line in text.splitlines() if "\t" in line and _are_axes(_titles(line.lstrip("# ").split("\t")))
         )

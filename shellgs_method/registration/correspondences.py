@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ntpath
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -148,6 +149,17 @@ def residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
 def worst_first(points: Sequence[Point]) -> list[Point]:
     """Sort points by residual, largest first."""
     return sorted(points, key=lambda point: -point.residual)
+
+
+def without_common_folder(names: Sequence[str]) -> list[str]:
+    """Names of photographs without the folder that they share where they are whole paths, as exiftool's are."""
+    if not names or not all(PureWindowsPath(name).anchor for name in names):
+        return [*names]
+    try:
+        above = ntpath.commonpath([ntpath.dirname(name) for name in names])
+    except ValueError:  # of several drives
+        return [*names]
+    return [PureWindowsPath(name).relative_to(above).as_posix() for name in names]
 
 
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:

@@ -29,6 +29,7 @@ from shellgs_method.registration.correspondences import (
     fit_robustly,
     measured_again,
     view_named,
+    without_common_folder,
     worst_first,
 )
 from shellgs_method.shell.alignment import Alignment
@@ -113,11 +114,13 @@ def _picks_of(table: Table, views: Sequence[View], crs: str) -> tuple[list[Pick]
     captured: list[str] = []
     elsewhere: list[tuple[str, str]] = []
     convert, columns = table.to_shell(crs), table.columns({**PIXELS, "image": IMAGE, "name": NAME}, _COLUMNS)
-    for where, row in table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name"):
+    rows = [*table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name")]
+    images = without_common_folder([row["image"] for _, row in rows])
+    for (where, row), image in zip(rows, images, strict=True):
         coordinates = [row[axis] for axis in "XYZ"]
         point, pixel = np.array(coordinates, dtype=np.float64), (float(row["x"]), float(row["y"]))
         name = row["name"] or named.setdefault(tuple(point), " ".join(coordinates))
-        view = view_named(row["image"], views, where)
+        view = view_named(image, views, where)
         if view is None:
             elsewhere.append((name, row["image"]))
             continue

@@ -24,6 +24,7 @@ from shellgs_method.registration.correspondences import (
     Correspondence,
     fit_robustly,
     view_named,
+    without_common_folder,
     worst_first,
 )
 
@@ -58,8 +59,10 @@ def read_positions(path: Path, views: Sequence[View], crs: str = "") -> Surveyed
     columns = table.columns({"image": (*IMAGE, *NAME)}, {"image": 0, "X": 1, "Y": 2, "Z": 3})
     found: dict[str, tuple[View, list[float]]] = {}
     unknown: list[str] = []
-    for where, row in table.rows(columns, "the image, then X Y Z in the shell's coordinates; quote a name with spaces"):
-        view = view_named(row["image"], views, where)
+    rows = [*table.rows(columns, "the image, then X Y Z in the shell's coordinates; quote a name with spaces")]
+    images = without_common_folder([row["image"] for _, row in rows])
+    for (where, row), image in zip(rows, images, strict=True):
+        view = view_named(image, views, where)
         if view is None:
             unknown.append(row["image"])
         elif view.name in found:

@@ -832,6 +832,26 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     assert positions.unknown == ["lost.jpg"]
 
 
+@pytest.mark.parametrize("above", ["/home/user/flight/", "C:\\flight\\", "./"])
+def test_positions_and_picks_may_name_photographs_by_whole_paths(tmp_path, above):
+    """As exiftool's lists do, on the machine that the photographs were on."""
+    views = [replace(view, image=Path(view.name)) for view in rig()[0]]
+    (tmp_path / "geo.txt").write_text(
+        "SourceFile,X,Y,Z\n" + "".join(f"{above}{k}.png,{k},5,6\n" for k in (0, 2)) + f"{above}other/0.png,7,7,7\n"
+    )
+    positions = read_positions(tmp_path / "geo.txt", views)
+    assert [view.name for view in positions.views] == ["images/0.png", "images/2.png"]
+    assert [name.replace("\\", "/") for name in positions.unknown] == [f"{above}other/0.png".replace("\\", "/")]
+    (tmp_path / "picks.txt").write_text("".join(f"1 2 3 4 {k} {above}{k}.png a\n" for k in (0, 2)))
+    (pick,) = read_picks(tmp_path / "picks.txt", views)
+    assert [*pick.pixels] == ["images/0.png", "images/2.png"]
+
+
+def test_excels_line_of_its_separator_is_no_header(rigged, tmp_path):
+    (tmp_path / "geo.txt").write_text("sep=;\nimage;Y;X;Z\nimages/0.png;5;4;6\n")
+    np.testing.assert_array_equal(read_positions(tmp_path / "geo.txt", rigged[0]).shell, [[4, 5, 6]])
+
+
 @pytest.mark.parametrize(
     "header",
     [
