@@ -55,7 +55,7 @@ NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
-VERSION = 17
+VERSION = 18
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from shellgs_method.geometry.camera import Camera
@@ -19,6 +20,9 @@ fewer photographs show the same."""
 MOVES_ON = 4.0
 """Most pixels by which a place moves in the nearest photograph from one tried depth to the next. Where photographs are
 far apart, thin things were between two."""
+_SAME, _AHEAD = 3.0, 0.94
+"""Parallax of the shell in pixels, and cosine of the angle, within which cameras show the same: less than the cameras
+of a walk are apart, and the directions of a panorama."""
 PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
 PER_SIDE_BEHIND = 2
@@ -70,7 +74,8 @@ def neighbours(
 def sides(view: Camera, others: Sequence[Camera], depth: float) -> Sides:
     """Distances and indices of the cameras left and right of a view that look in about the same direction.
 
-    Those at the view's own position, relative to the typical depth of the shell, show no parallax and are left out.
+    Those at the view's own position, relative to the typical depth of the shell, show no parallax and are left out. So
+    are those that show the same as a nearer one, as the next frames of a video: where one errs, they all do.
     """
     found: Sides = ([], [])
     if others:
@@ -79,6 +84,13 @@ def sides(view: Camera, others: Sequence[Camera], depth: float) -> Sides:
         away = steps.norm(dim=-1)
         alike = (viewmats[:, 2, :3] @ view.viewmat[2, :3] > 0.5) & (away > 1e-6 * depth)
         is_right, baselines = (steps @ view.viewmat[0, :3] > 0).tolist(), away.tolist()
-        for index in alike.nonzero()[:, 0].tolist():
+        centres, ahead = steps.numpy(), viewmats[:, 2, :3].numpy()
+        apart = _SAME * depth / float(view.K[0, 0])
+        kept: list[int] = []
+        for index in sorted(alike.nonzero()[:, 0].tolist(), key=baselines.__getitem__):
+            near = np.linalg.norm(centres[kept] - centres[index], axis=1) < apart
+            if not (near & (ahead[kept] @ ahead[index] > _AHEAD)).any():
+                kept.append(index)
+        for index in sorted(kept):
             found[is_right[index]].append((baselines[index], index))
     return found
