@@ -25,17 +25,11 @@ class Finding(NamedTuple):
 
 def examine() -> Iterator[Finding]:
     """Check everything that a wheel or a package index cannot guarantee."""
-    for check in (_torch, _torchvision, _open3d, _compiler, _cuda, _gsplat, _lpips):
+    yield _import("torch", "pip install torch")
+    # Mismatched builds of the two fail with an unknown operator.
+    yield _import("torchvision", "pip install --force-reinstall torch torchvision, both from one index")
+    for check in (_open3d, _compiler, _cuda, _gsplat, _lpips):
         yield check()
-
-
-def _torch() -> Finding:
-    return _import("torch", "torch", "pip install torch")
-
-
-def _torchvision() -> Finding:
-    """Mismatched builds of torch and torchvision fail with an unknown operator."""
-    return _import("torchvision", "torchvision", "pip install --force-reinstall torch torchvision, both from one index")
 
 
 def _open3d() -> Finding:
@@ -45,11 +39,11 @@ def _open3d() -> Finding:
         return Finding("Open3D", False, str(error))
 
 
-def _import(subject: str, module: str, remedy: str) -> Finding:
+def _import(module: str, remedy: str) -> Finding:
     try:
-        return Finding(subject, True, importlib.import_module(module).__version__)
+        return Finding(module, True, importlib.import_module(module).__version__)
     except (ImportError, OSError, RuntimeError) as error:
-        return Finding(subject, False, f"{_first_line(error)}; remedy: {remedy}")
+        return Finding(module, False, f"{_first_line(error)}; remedy: {remedy}")
 
 
 def _first_line(error: Exception) -> str:

@@ -30,13 +30,7 @@ from shellgs_method.registration.picks import PickedPoint, align_picks, picked_a
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.validation import (
-    Check,
-    agreement_check,
-    rival_check,
-    rounding_of,
-    steps_in_metres,
-)
+from shellgs_method.registration.validation import Check, check_of, rounding_of, steps_in_metres
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.surface import ShellSurface
@@ -327,7 +321,10 @@ def place_by_guess(
         for rival in rivals
         if rival.score >= AMBIGUOUS * best.score
     ]
-    checks = [agreement_check(best.score), *(rival_check(rival.score / best.score) for rival in rivals[:1])]
+    checks = [check_of("agreement", best.score, "Agreement with the cameras' sightlines", "{:.0%}")]
+    for rival in rivals[:1]:
+        name = "Agreement elsewhere, relative to that in place"
+        checks.append(check_of("elsewhere", rival.score / best.score, name, "{:.2f}"))
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = Alignment(matrix, shells, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)

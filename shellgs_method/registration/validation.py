@@ -203,10 +203,11 @@ class Unbending:
         """What was held out of the adjustment: it must not be worse than before."""
         before, now = self.adjustment.held_out.pixels
         name = "Bent: reprojection error of tracks held out, relative to the one before"
-        yield _check("bent_pixels", now / before if before else 1.0, name, "{:.2f}")
+        yield check_of("bent_pixels", now / before if before else 1.0, name, "{:.2f}")
         farther = after.check_points - self.before.check_points
         if not np.isnan(farther):
-            yield _check("bent_check", farther, "Bent: check points, median residual, less the one before", "{:+.3f} m")
+            name = "Bent: check points, median residual, less the one before"
+            yield check_of("bent_check", farther, name, "{:+.3f} m")
 
 
 def validate(
@@ -231,12 +232,12 @@ def validate(
     steps = steps_in_metres(mesh, alignment, views, points)
     supports = [look(caster, view, points, survey_from_scene) for view in views]
     seeing = [support for support in supports if len(support.hits)]
-    sight = _check("views", len(seeing) / max(len(views), 1), "Views that see the shell", "{:.0%}")
+    sight = check_of("views", len(seeing) / max(len(views), 1), "Views that see the shell", "{:.0%}")
     if not seeing:
         return Validation(alignment, [sight])
     distance = float(np.median([support.distance for support in seeing]))
     key = "closeness" if distance < LIMITS["closeness"].good else "distance"
-    size = _check(key, distance, "Distance from cameras to shell, median (units)", "{:.3g} m")
+    size = check_of(key, distance, "Distance from cameras to shell, median (units)", "{:.3g} m")
     if size.verdict == "refused":
         return Validation(alignment, [sight, size], supports)
     cameras = transformed(positions(view.camera for view in views), survey_from_scene)
@@ -266,16 +267,6 @@ def validate(
     return replace(measured, checks=[sight, size, *_checks(measured)])
 
 
-def agreement_check(agreement: float) -> Check:
-    """The check of a proposal's agreement with what the cameras saw."""
-    return _check("agreement", agreement, "Agreement with the cameras' sightlines", "{:.0%}")
-
-
-def rival_check(relative: float) -> Check:
-    """The check of the agreement elsewhere, relative to that of a proposal."""
-    return _check("elsewhere", relative, "Agreement elsewhere, relative to that in place", "{:.2f}")
-
-
 def steps_in_metres(
     mesh: ShellMesh, alignment: Alignment, views: Sequence[View], points: SparsePoints
 ) -> dict[str, Step]:
@@ -296,28 +287,29 @@ def _checks(measured: Validation) -> Iterator[Check]:
     for what, step in measured.steps.items():
         if step.coarsest >= SHOWN:
             name = f"Steps of {what}" + ("" if step.rounded else ", if they were rounded")
-            check = _check("step", step.coarsest, name, step.in_words())
+            check = check_of("step", step.coarsest, name, step.in_words())
             yield check if step.rounded or check.verdict == "good" else replace(check, verdict="doubtful")
-    yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
-    yield _check("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
-    yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
+    yield check_of("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
+    yield check_of("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
+    yield check_of("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
     if measured.test is not None:
         evidence = measured.test.evidence
         if not measured.alignment.model:  # adjusted cameras fit picks and weighted tracks better than points alone tell
-            yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
+            yield check_of("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
         words = "; ".join(evidence.in_words(measured.axes))
         name = "Directions the points do not determine"
-        yield _check("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
+        yield check_of("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
-        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
+        yield check_of("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
     if measured.mirrored is not None:
-        yield _check("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
+        yield check_of("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
     if not np.isnan(measured.check_points):
-        yield _check("check", measured.check_points, "Check points, median residual", "{:.3f} m")
+        yield check_of("check", measured.check_points, "Check points, median residual", "{:.3f} m")
 
 
-def _check(key: str, value: float, name: str, form: str) -> Check:
+def check_of(key: str, value: float, name: str, form: str) -> Check:
+    """The check of a value by the :data:`LIMITS` of a key: what it is called, and how it is shown."""
     limit = LIMITS[key]
     sign = "≤" if limit.good <= limit.refused else "≥"
     percent = "%" in form

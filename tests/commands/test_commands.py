@@ -271,7 +271,7 @@ def test_doctor_names_the_kind_of_an_error_without_words(monkeypatch):
 
     monkeypatch.setattr("importlib.import_module", fail)
     monkeypatch.setattr(doctor, "lpips_weights", fail)
-    assert doctor._torch().detail == "ImportError; remedy: pip install torch"
+    assert doctor._import("torch", "pip install torch").detail == "ImportError; remedy: pip install torch"
     assert doctor._lpips().detail == "ImportError"
 
 
