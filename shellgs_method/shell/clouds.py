@@ -19,12 +19,12 @@ from shellgs_method.machine.open3d import import_open3d, reason
 
 Mesher = Literal["planes", "bpa", "poisson"]
 
-VERSION = 3
+VERSION = 4
 """Version of the meshers and of what the readers of clouds leave out: clouds are meshed again if it changes."""
 
 LONGEST_EDGE = 3.0  # this and the next two lengths are in units of the cloud's spacing
 NEIGHBOURHOOD = 2.5
-BALLS = 0.8, 1.6
+BALLS = 0.9, 1.6
 NO_PLANE = -1
 FAILURES = 6  # of RANSAC
 LEAST_POINTS = 150  # in a plane

@@ -76,6 +76,18 @@ def test_the_planes_mesher_removes_noise_from_the_normals_of_walls():
     assert np.median(tilt) < 0.3  # 1 cm of noise on points 9 cm apart tilts triangles by degrees
 
 
+def test_a_round_wall_has_hardly_any_holes():
+    """A tower of a radius of 3 m, with five points in each voxel of 6 cm."""
+    rng, voxel = np.random.default_rng(0), 0.06
+    angle, height = rng.uniform(-1.5, 1.5, 50_000), rng.uniform(-2, 2, 50_000)
+    points = np.stack([3 * np.sin(angle), height, 3 - 3 * np.cos(angle)], axis=1)
+    cells = np.unique(np.floor(points / voxel), axis=0, return_inverse=True)[1].ravel()
+    means = [np.bincount(cells, along) / np.bincount(cells) for along in points.T]
+    cue = ShellCaster(meshed(np.stack(means, axis=1)), np.eye(4)).cast(camera().scaled(8))
+    there = np.s_[150:330, 180:460]
+    assert (~cue.mask[there]).mean() < 0.001
+
+
 def test_a_cloud_in_survey_coordinates_gives_the_same_mesh_as_a_local_one():
     points = scan()
     local, survey = meshed(points), meshed(points + GEOREFERENCE, viewpoints=STREET + GEOREFERENCE)
