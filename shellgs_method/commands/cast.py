@@ -217,6 +217,7 @@ def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], u
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.facade import held_out_names, read_views
+    from shellgs_method.files.sparse_points import find_sparse_points
     from shellgs_method.occlusion import (
         CONTRADICTED_PLACES,
         MANY,
@@ -227,7 +228,7 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     )
 
     views = read_views(config)
-    found = check_views(scene, views, held_out_names(config))
+    found = check_views(scene, views, held_out_names(config), find_sparse_points(config))
     console.print(
         f"Photographs contradict {found.contradicted:.1%} of these pixels: they show an occluder or the background "
         f"({found.checked} views compared, {found.skipped} already there, in {found.seconds:.1f} s)."

@@ -21,6 +21,7 @@ from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
 from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import workers
@@ -47,7 +48,7 @@ from shellgs_method.occlusion.exposure import (
     sightings_on_surface,
 )
 from shellgs_method.occlusion.low_light import LowLight
-from shellgs_method.occlusion.neighbours import sides
+from shellgs_method.occlusion.neighbours import FARTHEST, sides
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
@@ -55,6 +56,8 @@ NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
+NEARBY = 0.005
+"""Share of a view's SfM points on the shell that are so near only if something is: of wrong ones a thousandth is."""
 VERSION = 18
 """Version of the maps: maps of another version are made again."""
 
@@ -78,7 +81,9 @@ class CheckSummary:
     seconds: float
 
 
-def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -> CheckSummary:
+def check_views(
+    scene: Path, views: Sequence[View], held_out: Collection[str], points: SparsePoints | None = None
+) -> CheckSummary:
     """Compare the photographs on the shell and in front of it, and store the maps in ``scene/cues/checked``.
 
     The maps are those that :class:`~shellgs_method.files.cue_maps.Findings` decodes. Photographs are inconclusive on
@@ -91,6 +96,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
         held_out: names of the held-out views.
+        points: the SfM points, if any: where they are near a camera, something that near is looked for.
 
     Raises:
         FileNotFoundError: the scene has no shell maps.
@@ -113,7 +119,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     if missing:
         inputs = fingerprint(maps.manifest.sources, maps.manifest.max_image_size)[:16]
         compared_with = [view for view in views if view.name not in held_out]
-        training = _TrainingViews.of(compared_with, shell, maps.folder / f".{inputs}")
+        training = _TrainingViews.of(compared_with, shell, points, maps.folder / f".{inputs}")
 
         def compare(view: View) -> CueMap:
             return training.compare(view, shell.require(view.name, cameras[view.name]))
@@ -152,15 +158,16 @@ class _TrainingViews:
     """Possible error of the shell's place, in scene units; 0 where their size is not known."""
     windows: bool
     """Whether the shell's model has windows: elsewhere, nothing is seen behind it."""
+    points: SparsePoints | None
 
     @classmethod
-    def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
+    def of(cls, views: Sequence[View], shell: CueMaps, points: SparsePoints | None, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
         size = shell.manifest.max_image_size
         taken, windows = {}, False
         for view in views:
             cue = shell.require(view.name, view.camera.shrunk(size))
-            taken[view.name] = _shell_view(view, cue)
+            taken[view.name] = _shell_view(view, cue, points)
             windows |= cue.classes is not None and bool((cue.classes == SurfaceClass.WINDOW).any())
         gains, surface = _gains([_exposed(seen) for seen in taken.values()])
         shell_views = {
@@ -183,7 +190,7 @@ class _TrainingViews:
                 write_whole(files[name], content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
         colours = ColourModel(shell_views.values(), sweeps.values())
-        return cls(shell_views, surface, light, sweeps, colours, _error(shell.manifest), windows)
+        return cls(shell_views, surface, light, sweeps, colours, _error(shell.manifest), windows, points)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -225,7 +232,7 @@ class _TrainingViews:
         """A view at the mean exposure, and brightened as the training views are."""
         if view.name in self.views:
             return self.views[view.name]
-        seen = _shell_view(view, cue)
+        seen = _shell_view(view, cue, self.points)
         return self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
 
     def _behind(
@@ -262,17 +269,26 @@ def _told_apart(
     return static & ~moved, moved
 
 
-def _shell_view(view: View, cue: CueMap) -> ShellView:
+def _shell_view(view: View, cue: CueMap, points: SparsePoints | None) -> ShellView:
     camera = view.camera.shrunk(MAX_SIZE)
     view = replace(view, camera=camera)
     image = load_photograph(view)
     depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))
+    nearby = points is not None and _any_nearby(view, depth.numpy(), points)
     kept = load_mask(view)
     if kept is None:
-        return ShellView(camera, torch.from_numpy(image), depth)
+        return ShellView(camera, torch.from_numpy(image), depth, nearby=nearby)
     # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.
     counts = torch.from_numpy(cv2.erode(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
-    return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts)
+    return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts, nearby=nearby)
+
+
+def _any_nearby(view: View, depth: Float[np.ndarray, "h w"], points: SparsePoints) -> bool:
+    """Whether more of a view's points on the shell are nearer than the depths that are always tried than err so far."""
+    pixels, z = points.seen_in(view)
+    columns, rows = pixels.astype(int).T
+    shell = depth[rows, columns]
+    return bool((shell > (1 + FARTHEST) * z).sum() > NEARBY * (shell > 0).sum())
 
 
 def _error(shell: Manifest) -> float:

@@ -25,6 +25,8 @@ from torch.nn.functional import grid_sample
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.occlusion.neighbours import (
+    FARTHEST,
+    FARTHEST_NEARBY,
     OFFSETS_BEHIND,
     PER_SIDE,
     PER_SIDE_BEHIND,
@@ -72,6 +74,7 @@ class ShellView:
         depth: z-depth of the shell in scene units, 0 where there is none, or where the photograph does not count.
         kept: pixels of the photograph that count; None for all.
         noise: standard deviation of its noise, of 255, where that is large.
+        nearby: whether it shows something nearer than two fifths of the shell's depth, by the SfM points.
     """
 
     camera: Camera
@@ -79,6 +82,7 @@ class ShellView:
     depth: Float[Tensor, "h w"]
     kept: Bool[Tensor, "h w"] | None = None
     noise: float = 0.0
+    nearby: bool = False
 
     @cached_property
     def silhouette(self) -> Bool[Tensor, "h w"]:
@@ -121,7 +125,8 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
         return _nothing(view)
     pixels = _Pixels(view)
     near = _sides_of(pixels, others)
-    offsets, scores = offsets_before(view.camera, near, pixels.depth), []
+    offsets = offsets_before(view.camera, near, pixels.depth, FARTHEST_NEARBY if view.nearby else FARTHEST)
+    scores = []
     for k in range(0, len(offsets), _AT_ONCE):
         on_shell, nearer = _costs(pixels, others, near, offsets[k : k + _AT_ONCE]).amin(dim=2)
         scores.append(_smooth(pixels, on_shell - nearer))

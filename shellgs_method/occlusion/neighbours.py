@@ -9,7 +9,9 @@ import torch
 
 from shellgs_method.geometry.camera import Camera
 
-_NEAREST, _FARTHEST, _STEP = 0.0125, 1.38, 1.4
+_NEAREST, _STEP = 0.0125, 1.4
+FARTHEST, FARTHEST_NEARBY = 1.38, 9.0
+"""Largest offset that is tried, two fifths of the shell's depth, and the one where SfM points are nearer than that."""
 _FINEST = 0.02  # difference of offsets below which none is tried, however far apart the cameras are
 OFFSETS_BEHIND = tuple(-2 * _NEAREST * 2.0**k for k in range(6))
 """Tried depths behind the shell, as the relative excess of their inverse over the shell's: from 20 cm behind a wall
@@ -32,21 +34,22 @@ Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
 """Distances and indices of cameras on the left and on the right of a view."""
 
 
-def offsets_before(view: Camera, others: Sides, depth: float) -> list[float]:
+def offsets_before(view: Camera, others: Sides, depth: float, farthest: float = FARTHEST) -> list[float]:
     """Depths to try in front of the shell, as the relative excess of their inverse over the shell's.
 
-    They reach from 10 cm in front of a wall that is 8 m away to two fifths of its depth. Each is 1.4 times the one
-    before; less where the nearest camera would see a place move by more than :data:`MOVES_ON`.
+    They begin 10 cm in front of a wall that is 8 m away. Each is 1.4 times the one before; less where the nearest
+    camera would see a place move by more than :data:`MOVES_ON`.
 
     Args:
         view: the view's camera.
         others: the other cameras, by :func:`sides`.
         depth: typical depth of the shell in the view.
+        farthest: offset that they reach.
     """
     nearest = min((baseline for side in others for baseline, _ in side), default=depth)
     most = max(MOVES_ON * depth / (nearest * float(view.K[0, 0])), _FINEST)
     offsets = [_NEAREST]
-    while offsets[-1] < _FARTHEST:
+    while offsets[-1] < farthest:
         offsets.append(min(_STEP * offsets[-1], offsets[-1] + most))
     return offsets
 

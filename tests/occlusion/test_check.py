@@ -30,6 +30,7 @@ from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.map_files import BACKGROUND
 from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.transfer import DARK, POWER
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
@@ -524,6 +525,28 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
         assert (found.background == ((wall > 0) & ~inside)).mean() > 0.99
         assert not (found.occluder | found.moved)[sky].any()
         assert found.occluder.mean() < 0.01
+
+
+def test_what_is_near_the_camera_is_found_in_its_place_where_points_of_it_are(tmp_path: Path):
+    """A post at a quarter of the wall's depth. One wrong point of a thousand is no sign of it, nor is one before it."""
+    wall, normal = np.full((HEIGHT, WIDTH), WALL, np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float16)
+    shell, views, posts = CueMaps.create(tmp_path, "shell", command="cast"), [], []
+    for index, (view, post) in enumerate(street([camera_at(x) for x in np.linspace(-1, 1, 13)], post=WALL / 4)):
+        views.append(stored(tmp_path, index, view.image.numpy(), view.camera))
+        posts.append(post)
+        shell.write(views[-1].name, CueMap(wall, normal, wall > 0), view.camera)
+    on_wall, on_post = np.full((1000, 3), [0.0, 0.0, WALL]), np.full((20, 3), [0.3, 0.0, WALL / 4])
+    before = on_post * 2  # in the same pixel, at half of the depth
+    places = []
+    for near in (on_post[:0], on_post[:1], before, on_post):
+        shutil.rmtree(tmp_path / "cues/checked", ignore_errors=True)
+        check_views(tmp_path, views, [], SparsePoints(np.concatenate([on_wall, near])))
+        checked = CueMaps.open(tmp_path, "checked").require(views[6].name, views[6].camera)
+        places.append(checked.depth[posts[6]])
+    assert all((place == places[0]).all() for place in places[1:3])
+    right = [(np.abs(place / (WALL / 4) - 1) < 0.1).mean() for place in places]
+    assert right[0] < 0.1
+    assert right[3] > 0.8
 
 
 def test_an_interrupted_check_does_not_go_on_with_another_shell(tmp_path: Path, monkeypatch):
