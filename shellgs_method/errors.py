@@ -49,13 +49,14 @@ _DISK = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota of the disk is used up",
     errno.EFBIG: "the disk takes no file of that size",
-    errno.EROFS: "the disk is read-only",
 }
 
 
 def explained(error: OSError) -> str:
     """Describe a file error in one sentence."""
     name = error.filename or "a file"
+    if error.errno == errno.EROFS:
+        return f"{name} cannot be written, the disk is read-only: work on a copy elsewhere, or write there"
     if why := _DISK.get(error.errno or 0):
         return f"{name} cannot be written, {why}: make room and run the same command again; existing files are kept"
     return f"{name} cannot be used: {(error.strerror or str(error)).lower()}"

@@ -678,7 +678,7 @@ def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(scene, shellgs, comm
 
 
 @pytest.mark.parametrize(
-    ("number", "words"), [(errno.EROFS, "the disk is read-only"), (errno.EACCES, "permission denied")]
+    ("number", "words"), [(errno.EROFS, "the disk is read-only: work on a copy"), (errno.EACCES, "permission denied")]
 )
 @pytest.mark.parametrize("command", ["cast", "align"])
 def test_a_scene_that_cannot_be_written_ends_in_one_sentence(scene, shellgs, monkeypatch, command, number, words):
