@@ -262,6 +262,11 @@ class Run:
         if self.begun:
             # An earlier version did not write all settings: those that it lacks had their defaults or did not exist.
             known = settings | default_settings(self.variant.method) | recorded_settings(path)
+            if (
+                getattr(self.trainer.pipeline.model, "trust", "") == "photographs"
+                and "checked maps" in self._cast_since
+            ):
+                known["checked maps"] = "none"  # it was trained without them
             changed = [key for key in settings if settings[key] != known[key]]
             if changed:
                 what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])
@@ -281,12 +286,18 @@ class Run:
             SceneError: as :meth:`check`.
         """
         self.check()
-        if not self.trained:  # its last checkpoint may have been deleted
+        measured_before = self.begun and bool(self._cast_since)
+        if not self.trained or measured_before:  # not trained: its last checkpoint may have been deleted
             for half in (None, *self.halves):
                 self.metrics(half).unlink(missing_ok=True)
-        if not self.begun:
+        if not self.begun or measured_before:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_whole(self.recorded, json.dumps(self.settings, indent=2))
+
+    @property
+    def _cast_since(self) -> list[str]:
+        """Maps that were cast after the run began, of which its metrics know nothing."""
+        return [key for key in self.settings if key.endswith(" maps") and key not in recorded_settings(self.recorded)]
 
     @property
     def recorded(self) -> Path:

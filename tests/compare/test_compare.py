@@ -37,7 +37,7 @@ from shellgs_method.compare import results
 from shellgs_method.compare.measure import Snapshot, _snapshot, measure, measure_shell, write_metrics
 from shellgs_method.compare.plots import DOT, dotted, exposures, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
-from shellgs_method.compare.runs import Run, Variant, grid
+from shellgs_method.compare.runs import OtherSettingsError, Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.errors import SceneError
@@ -340,6 +340,31 @@ def test_a_run_without_its_last_checkpoint_is_trained_and_measured_again(pristin
     finish_all([run])
     assert run.finished
     assert run.metrics().read_text() != "of the run before"
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_run_from_before_the_maps_were_cast_is_measured_again(scene, tmp_path):
+    """Nothing of it is against the shell; one that would have been trained with these maps is another run."""
+    away = scene.rename(tmp_path / "away")
+    shutil.copytree(away, scene, ignore=shutil.ignore_patterns("cues"))
+    plain = fake_grid([scene], ["2dgs"], tmp_path / "out")
+    finish_all(plain)
+    shutil.copytree(away / "cues", scene / "cues")
+    trained = (plain[0].checkpoints / "step-000000019.ckpt").stat().st_mtime_ns
+    for measured_again in (True, False):
+        marked = json.loads(plain[0].metrics().read_text()) | {"mark": 1}
+        plain[0].metrics().write_text(json.dumps(marked))
+        finish_all(fake_grid([scene], ["2dgs"], tmp_path / "out"))
+        assert (json.loads(plain[0].metrics().read_text()) != marked) == measured_again
+    assert (plain[0].checkpoints / "step-000000019.ckpt").stat().st_mtime_ns == trained
+
+    runs = fake_grid([scene], ["shellgs", "shellgs-metric"], tmp_path / "out")
+    finish_all(runs)
+    shutil.copytree(scene / "cues/shell", scene / "cues/checked")
+    theirs, ours = fake_grid([scene], ["shellgs", "shellgs-metric"], tmp_path / "out")
+    theirs.check()
+    with pytest.raises(OtherSettingsError, match="checked maps: none, now"):
+        ours.check()
 
 
 @pytest.mark.usefixtures("fake_commands")
