@@ -29,12 +29,12 @@ from tyro.conf import Suppress
 from shellgs_method.bounds import Rate
 from shellgs_method.errors import INTERRUPTED, SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import write_whole
+from shellgs_method.files.locks import claimed, held
 from shellgs_method.gaussians.pruning import broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.interrupts import at_interrupt
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint, unwritten
-from shellgs_method.runs.folders import claimed, held
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training

@@ -27,8 +27,8 @@ from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, fingerprint, read_json, write_whole
+from shellgs_method.files.locks import held
 from shellgs_method.files.scene import ALIGNMENT
-from shellgs_method.runs.folders import held
 
 if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run

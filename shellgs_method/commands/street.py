@@ -46,7 +46,7 @@ def street(
     check_output_folder(output)
     from shellgs_method.blocks.merge import check_free, merge
     from shellgs_method.blocks.street import Street, script, train
-    from shellgs_method.runs.folders import held
+    from shellgs_method.files.locks import held
 
     plan = Street.plan(scene, method, iterations, coarse_iterations, coarse_scale, seed, output, paths)
     check_free(plan.merged)

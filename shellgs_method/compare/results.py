@@ -18,7 +18,7 @@ from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.tables import rich_table
 from shellgs_method.files.atomic import write_whole
-from shellgs_method.runs.folders import held
+from shellgs_method.files.locks import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finish runs; return those that failed, with the reason."""

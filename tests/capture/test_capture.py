@@ -48,6 +48,7 @@ from shellgs_method.capture.photographs import (
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
+from shellgs_method.files.locks import held
 from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph, read_image
 from shellgs_method.files.transfer import linear_of, srgb, tone_mapped
 from shellgs_method.synthetic import FacadeConfig, write_scene
@@ -1099,6 +1100,19 @@ def test_a_folder_of_another_in_the_place_of_the_captures_is_refused_and_undistu
         capture(tmp_path / "photographs", tmp_path / "scene")
     with pytest.raises(SceneError, match="at least 3 photographs, not 2"):  # now it is the capture's own
         capture(tmp_path / "photographs", tmp_path / "scene")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="nothing is locked")
+def test_a_second_capture_of_one_scene_is_refused_while_the_first_goes_on(tmp_path):
+    """Both wrote one database, and COLMAP failed without a reason."""
+    (tmp_path / "photographs").mkdir()
+    for number in range(3):
+        photograph(seed=number).save(tmp_path / "photographs" / f"{number}.jpg")
+    (work := tmp_path / "scene/capture").mkdir(parents=True)
+    with held(work) as alone:
+        assert alone
+        with pytest.raises(SceneError, match=r"another capture of .* is going on: wait for it"):
+            capture(tmp_path / "photographs", tmp_path / "scene")
 
 
 @pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])

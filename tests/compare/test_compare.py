@@ -46,12 +46,12 @@ from shellgs_method.evaluation.tables import Column, csv_table, html_table, late
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.atomic import recover_folder, replace_folder
 from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.locks import held
 from shellgs_method.files.scene import SceneLayout, ScenePaths
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.launch import cluster, display, local
 from shellgs_method.launch.local import CommandError, follow, launch_locally
 from shellgs_method.pipeline import FacadePipeline
-from shellgs_method.runs.folders import held
 
 COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
 SEEDS = {"shellgs_&_all": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "photo-gs": {"psnr": [26.6, 27.0]}}

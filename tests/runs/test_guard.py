@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer
 from training_runs import data_of, model_of, render, small_disk, trainer_of
 
 import method_configs
-from shellgs_method.runs.folders import held
+from shellgs_method.files.locks import held
 from shellgs_method.runs.guard import MAX_SKIPPED
 from shellgs_method.trainer import FacadeTrainer
 

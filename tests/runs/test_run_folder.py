@@ -19,9 +19,9 @@ from training_runs import trainer_of
 
 from shellgs_method.compare.measure import measure
 from shellgs_method.errors import SceneError
+from shellgs_method.files.locks import held
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.config_file import load_config
-from shellgs_method.runs.folders import held
 from shellgs_method.runs.run_folder import open_run
 from shellgs_method.runs.trained import load_run
 
