@@ -19,6 +19,7 @@ from PIL import Image
 from rich.progress import Progress
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from shellgs_method.capture.photographs import show_the_same
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.transfer import HDR, Transfer, narrowed, tone_mapped
 
@@ -39,7 +40,6 @@ _PAUSE = 10.0  # seconds between two frames that are no step, but a break, as wh
 _TIMED = ("mov", "avi")  # formats that say how long a stream is
 _WHOLE = 0.9  # of that time, is as good as all
 _BLACK = 32  # levels that compressed black reaches
-_HELD = 0.04  # of the contrast, by which frames may differ that show the same: as if it moved by 0.3 % of the width
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
@@ -72,7 +72,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             if number in chosen:
                 progress.advance(task)
                 small = _small(frame).astype(np.float32)
-                if before is not None and _is_held(before, small):
+                if before is not None and before.shape == small.shape and show_the_same(before, small):
                     held += 1
                     continue
                 before = small
@@ -93,10 +93,6 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
 def _small(frame: av.VideoFrame) -> UInt8[np.ndarray, "H W"]:
     height = max(1, round(_SMALL * frame.height / frame.width))
     return frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
-
-
-def _is_held(before: Float[np.ndarray, "H W"], after: Float[np.ndarray, "H W"]) -> bool:
-    return before.shape == after.shape and bool(np.abs(after - before).mean() < _HELD * after.std())
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float, Float32
 from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.capture.config import Cameras
@@ -51,9 +51,9 @@ _LENS_TAGS = (
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
 _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neighbours by time
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
-# at most, at a tenth of the light, others 0.28 and more. Of the same size, those encoded again have 0.02 and
-# others 0.19 and more.
-_SMALL, _ALIKE, _SAME = 32, 0.15, 0.04
+# at most, at a tenth of the light, others 0.28 and more.
+_SMALL, _ALIKE = 32, 0.15
+_SAME = 0.3  # pixels by which pictures may seem moved that show the same: those encoded again by 0.04, others by 0.9
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of EXIF's units of resolution: inch, centimetre, millimetre
 _SHRUNK = 0.9  # of a photograph's size in EXIF; a camera may write a few pixels more than it stores
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
@@ -397,13 +397,22 @@ def contrast(path: Path) -> float:
     return min(1.0, 2.0 ** round(np.log2(max(float(np.median(np.asarray(grey))), 1.0) / DARK)))
 
 
+def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "*N"]:
+    """Whether small grey pictures differ from one by less than if it moved a little, aside or up and down.
+
+    Less than its contrast would not do: of a plain wall between bright sky and dark ground, all have the same.
+    """
+    moved = min(np.abs(np.diff(after, axis=axis)).mean() for axis in (0, 1))
+    return np.abs(after - before).mean((-2, -1)) < _SAME * moved
+
+
 def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
     """Tell the user of photographs that show the same as others, as those that a messenger encoded again."""
     small = np.stack([_small(folder / name) for name in names])
     copies = [
         (name, names[int(alike.argmax())])
         for k, name in enumerate(names)
-        if (alike := np.abs(small[:k] - small[k]).mean((1, 2)) < _SAME * small[k].std()).any()
+        if (alike := show_the_same(small[:k], small[k])).any()
     ]
     if copies:
         notice(

@@ -611,6 +611,23 @@ def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog, l
     assert "(images_2/1.jpg is images/1.jpg, for example)" in caplog.text
 
 
+def test_a_walk_along_a_plain_wall_between_sky_and_ground_shows_no_copies(tmp_path, caplog):
+    wall = np.full((240, 1900, 3), 150, np.uint8)
+    wall[:80], wall[190:] = 245, 40
+    for x in range(30, 1900, 130):
+        wall[110:150, x : x + 25] = 135
+    wall = np.clip(wall + np.random.default_rng(0).normal(0, 4, wall.shape), 0, 255).astype(np.uint8)
+    walk = [Image.fromarray(wall[:, 10 * k : 10 * k + 320]) for k in range(150)]
+    write_video(tmp_path / "walk.mp4", walk)
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 200, QUIET)
+    assert len(numbers(tmp_path / "frames")) > 10
+    for k, picture in enumerate(walk[::17]):
+        picture.save(tmp_path / f"{k}.jpg", quality=95)
+    tell_of_near_copies(tmp_path, [f"{k}.jpg" for k in range(len(walk[::17]))])
+    assert not caplog.text
+
+
 def test_photographs_that_were_encoded_again_are_told(tmp_path, caplog):
     for k in range(3):
         photograph(64, 48, seed=k).resize((640, 480)).save(tmp_path / f"IMG_{k}.jpg")
