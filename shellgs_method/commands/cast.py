@@ -272,8 +272,9 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         )
     panel = _save_check_panel(scene, views)
     console.print(
-        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background, magenta "
-        "what windows show behind it, cyan where it is doubted; they confirm what is green."
+        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background, orange "
+        "what is behind a wall, magenta what windows show behind it, cyan where it is doubted; they confirm what is "
+        "green."
     )
 
 
