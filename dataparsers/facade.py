@@ -98,6 +98,8 @@ class FacadeDataParser(DataParser):
         there = _on_disk(recording.frames, used, config.data)
         if not (chosen := [k for k in chosen if k in there]):
             raise FileNotFoundError(f"none of the photographs of {config.data} for {split} is on disk: put some back.")
+        if not config.block:  # where a block is trained, others' photographs need not be
+            whole = chosen
         views = dict(zip(there, _views([recording.frames[k] for k in there], config), strict=True))
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)

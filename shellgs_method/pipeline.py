@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
-from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.bound_cameras import BoundCameras, stem
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import (
     SeededView,
@@ -157,6 +157,7 @@ class FacadePipeline(VanillaPipeline):
                     )
             self._check_exposures(loaded_state.get("_model.exposures.parameter"))
         super().load_pipeline(loaded_state, step)
+        self._find_exposures([*loaded_state.get("_extra_state", {}).get("cameras", {})])
 
     def _check_exposures(self, stored: Tensor | None) -> None:
         ours = self.model.exposures
@@ -171,6 +172,13 @@ class FacadePipeline(VanillaPipeline):
                 f"the checkpoint has exposures of {len(stored)} photographs, and the scene has "
                 f"{len(ours.parameter)} to train on: train on the same photographs, or anew"
             )
+
+    def _find_exposures(self, trained_on: Sequence[str]) -> None:
+        """Find the exposures of the scene's photographs by their names: some may have been taken out since training."""
+        ours = self.model.exposures
+        if ours is not None and self.test_mode != "val" and len(ours.parameter) == len(trained_on):
+            rows = {stem(name): row for row, name in enumerate(trained_on)}
+            ours.use([rows.get(stem(view.name)) for view in self.datamanager.train_dataset.views])
 
     def get_train_loss_dict(self, step: int):
         """One step on the next view."""

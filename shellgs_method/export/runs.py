@@ -247,8 +247,8 @@ class TrainedRun:
     def log_gains(self) -> Float64[np.ndarray, "V 3"]:
         """Exposures of the photographs of all views, in the order of :meth:`views`, against the mean of the training's.
 
-        Those of training views are learned; held-out photographs are compared with their renders, where
-        they are not masked out.
+        Those of training views are learned; photographs that are held out, or were not there, are compared with their
+        renders, where they are not masked out.
 
         Returns:
             Logarithms of the gains in linear light; 0 in a run whose exposures are fixed.
@@ -256,17 +256,21 @@ class TrainedRun:
         learned, (training, held_out) = self.model.exposures, self.datasets
         if learned is None:
             return np.zeros((len(training) + len(held_out), 3))
-        gains = [*learned.log_gains.cpu().double().numpy()]
-        for index in range(len(held_out)):
-            render = self.outputs(held_out, index)["rgb"]
-            photograph = held_out.get_numpy_image(index) / 255
-            kept = load_mask(held_out.views[index])
-            both = np.stack([render.cpu().double().numpy(), photograph])
-            colours = (both if kept is None else both[:, kept]).reshape(-1, 3)
-            view, point = np.indices((2, len(colours) // 2)).reshape(2, -1)
-            of_both = log_gains(Sightings(view, point, colours), np.zeros(2))
-            gains.append(of_both[1] - of_both[0])
-        return np.array(gains)
+        gains = learned.log_gains.cpu().double().numpy()
+        for index in learned.unknown:
+            gains[index] = self._log_gain(training, index)
+        return np.array([*gains, *(self._log_gain(held_out, index) for index in range(len(held_out)))])
+
+    def _log_gain(self, dataset: FacadeDataset, index: int) -> Float64[np.ndarray, " 3"]:
+        """The exposure of a photograph against its render."""
+        render = self.outputs(dataset, index)["rgb"]
+        photograph = dataset.get_numpy_image(index) / 255
+        kept = load_mask(dataset.views[index])
+        both = np.stack([render.cpu().double().numpy(), photograph])
+        colours = (both if kept is None else both[:, kept]).reshape(-1, 3)
+        view, point = np.indices((2, len(colours) // 2)).reshape(2, -1)
+        of_both = log_gains(Sightings(view, point, colours), np.zeros(2))
+        return of_both[1] - of_both[0]
 
     def splats(self) -> Splats:
         """The Gaussians in the frame, of a block's run those of its core."""

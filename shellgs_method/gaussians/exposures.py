@@ -29,11 +29,18 @@ class Exposures(nn.Module):
         self.parameter = nn.Parameter(torch.zeros(num_views, 3))
         used = range(num_views) if used is None else used
         self.register_buffer("_used", torch.tensor([*used]), persistent=False)
+        self.unknown = set[int]()
+        """Which of the photographs used were not trained on."""
 
     @property
     def log_gains(self) -> Float[Tensor, "V 3"]:
         """Logarithms of the gains of the photographs used."""
         return (self.parameter - self.parameter.mean(dim=0))[self._used]
+
+    def use(self, rows: Sequence[int | None]) -> None:
+        """Use other photographs: those of some rows of the parameter, None for photographs that have no row."""
+        self.unknown = {index for index, row in enumerate(rows) if row is None}
+        self._used = torch.tensor([row or 0 for row in rows], device=self._used.device)
 
     def start(self, log_gains: Float[np.ndarray, "V 3"]) -> None:
         """Start from gains that are known."""

@@ -60,7 +60,8 @@ class CoarseRun:
         if exposures is not None and len(exposures) != count:
             raise SceneError(
                 f"the coarse run {path.parent} has exposures of {len(exposures)} photographs, and the scene has "
-                f"{count} to train on: train it again"
+                f"{count} to train on: put back those that are not on disk, or take them out of the model, and train "
+                "it again"
             )
         trained_on = [stem(name) for name in state.get("_extra_state", {}).get("cameras", {})]
         views = zip(used, parsed.metadata["views"], strict=True)

@@ -164,6 +164,26 @@ def test_what_is_masked_out_does_not_change_the_exposure_of_a_held_out_photograp
     np.testing.assert_allclose(run.log_gains()[8], before[8], atol=0.2 * STOPS)
 
 
+def test_photographs_keep_their_exposures_when_one_is_taken_out_of_the_scene(changing, tmp_path):
+    """And a run without it, which ended in an IndexError, compares it with its render once it is there again."""
+    scene = Path(shutil.copytree(changing, tmp_path / "scene"))
+    runs = {}
+    for name in ("with", "without"):
+        trainer = trainer_of(scene, tmp_path / name, "shellgs_metric", iterations=4)
+        trainer.config.save_config()
+        trainer.train()
+        runs[name] = log_gains(trainer), trainer.base_dir / "config.yml"
+        (scene / "images/frame_00003.png").rename(tmp_path / "out.png") if name == "with" else None
+    before, config = runs["with"]
+    assert runs["without"][0].shape == (7, 3)
+    np.testing.assert_array_equal(TrainedRun.load(config).log_gains()[:7], np.delete(before, 1, axis=0))
+    (tmp_path / "out.png").rename(scene / "images/frame_00003.png")
+    without, config = runs["without"]
+    again = TrainedRun.load(config).log_gains()[:8]
+    np.testing.assert_array_equal(np.delete(again, 1, axis=0), without)
+    assert np.isfinite(again[1]).all()
+
+
 def test_a_resumed_run_has_the_same_exposures(changing, tmp_path, trained):
     half = trainer_of(changing, tmp_path / "half", "shellgs_metric", 60)
     half.config.steps_per_save = 30
