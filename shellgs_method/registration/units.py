@@ -20,10 +20,10 @@ from shellgs_method.registration.validation import Check, Validation
 from shellgs_method.shell.mesh import ShellMesh
 
 _UNITS = {1.0: "metre", 0.001: "millimetre", 0.01: "centimetre", 0.3048: "foot", 0.0254: "inch"}
-# Usual metres, the deviation of their logarithm, and the most that one may weigh: a drone flies at any height.
+# Usual metres, the deviation of their logarithm, and the most that one may weigh: drones fly high and far away.
 _USUAL = {
-    "cameras stand {:.3g} m from it": (14.0, 1.0, 4.0),
-    "it is {:.3g} m high": (12.0, 0.9, 4.0),
+    "cameras stand {:.3g} m from it": (14.0, 1.0, 1.5),
+    "it is {:.3g} m high": (12.0, 1.2, 4.0),
     "cameras are {:.3g} m above its lower edge": (1.6, 0.35, 2.0),
     "its storeys are {:.3g} m high": (3.3, 0.25, 4.0),
 }

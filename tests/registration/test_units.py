@@ -40,7 +40,17 @@ def test_feet_are_told_by_eyes_and_storeys(known):
 
 
 @pytest.mark.parametrize(
-    "lengths", [HOUSE, (45.0, 25.0, 1.2, 4.5), (30.0, 9.0, 12.0, 2.8), (4.0, 6.0, 2.5, 3.0), (20.0, 40.0, 30.0)]
+    "lengths",
+    [
+        HOUSE,
+        (45.0, 25.0, 1.2, 4.5),
+        (30.0, 9.0, 12.0, 2.8),
+        (4.0, 6.0, 2.5, 3.0),
+        (20.0, 40.0, 30.0),
+        (60.0, 100.0, 60.0),  # towers, cathedrals and castles, from the air
+        (100.0, 80.0, 40.0),
+        (150.0, 30.0, 80.0),
+    ],
 )
 def test_usual_buildings_and_drones_in_metres_are_not_doubted(lengths):
     assert likelier_unit(dict(zip(WORDS, lengths, strict=False)), 1.0) is None
