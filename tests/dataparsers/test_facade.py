@@ -222,6 +222,13 @@ def test_points_that_are_where_others_are_but_for_rounding_are_left_out(scene, c
     assert "are where others are" in caplog.text
 
 
+def test_a_dense_cloud_with_few_points_far_away_is_kept(scene):
+    wall = np.random.default_rng(0).uniform(size=(20_000, 3)) * [2, 1, 0.01]
+    cloud = np.vstack([wall, [[20_000, 0, 0]]]) + find_sparse_points(FacadeDataParserConfig(data=scene)).positions[0]
+    trimesh.PointCloud(cloud).export(scene / "sparse_pc.ply")
+    assert len(find_sparse_points(FacadeDataParserConfig(data=scene)).positions) == len(cloud)
+
+
 def test_points_that_are_all_in_one_place_are_refused(scene):
     cloud = find_sparse_points(FacadeDataParserConfig(data=scene)).positions
     trimesh.PointCloud(cloud.mean(axis=0) + 1e-6 * (cloud - cloud.mean(axis=0))).export(scene / "sparse_pc.ply")
