@@ -29,6 +29,7 @@ _REACH = 0.15  # of the longer side: largest displacement that is tried
 _OTHERS = 2  # photographs that must tell a point's colour, besides the one that is judged
 _SOME = 0.25  # correlation below which a gain is not relative any more: that of chance
 _FEW = 200  # points that tell nothing
+_AGREED = 0.4  # best correlation of half of the photographs, below which they agree nowhere, as on mirroring glass
 _MOST = 4_000_000  # projections of points into views
 
 
@@ -50,16 +51,17 @@ def displacements(views: Sequence[Exposed], training: Bool[np.ndarray, " V"]) ->
     grey, tells = seen.colour.mean(axis=1), training[seen.view]
     others = np.bincount(seen.point, tells, len(points))[seen.point] - tells
     sums = np.bincount(seen.point, tells * grey, len(points))[seen.point] - tells * grey
-    found = np.zeros((len(views), 2))
+    found, best = np.zeros((len(views), 2)), []
     for k, view in enumerate(views):
         told = (seen.view == k) & (others >= _OTHERS)
         pixels, _ = view.camera.project(points[torch.from_numpy(seen.point[told])])
         expected = sums[told] / others[told]
         moved, here, there = _displacement(view.image.mean(dim=-1).numpy(), pixels.long().numpy(), expected)
         share = np.array(moved) / max(view.camera.width, view.camera.height)
+        best.append(there)
         if there - here > GAIN * max(here, _SOME) and np.abs(share).max() > LEAST:
             found[k] = share
-    return found
+    return found if np.median(best) > _AGREED else np.zeros_like(found)
 
 
 def read_displaced(scene: Path) -> dict[str, tuple[int, int]]:

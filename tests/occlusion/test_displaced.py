@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from shellgs_method import occlusion
 from shellgs_method.geometry.camera import Camera
@@ -69,6 +70,15 @@ def test_what_too_little_is_known_of_is_not_displaced():
     assert not displacements(alone[:2], ALL[:2]).any()
     far = [view._replace(depth=torch.zeros(HEIGHT, WIDTH)) for view in row((4, 9, 0))]
     assert not displacements(far, ALL).any()
+
+
+def test_photographs_of_glass_that_mirrors_are_not_displaced():
+    mirrored = [gaussian_filter(RNG.normal(size=(HEIGHT, WIDTH)), 5) for _ in ALL]
+    views = [
+        view._replace(image=0.05 * view.image + torch.from_numpy(0.5 + 2 * other).float()[..., None])
+        for view, other in zip(row(), mirrored, strict=True)
+    ]
+    assert not displacements(views, ALL).any()
 
 
 def test_a_plain_photograph_is_not_displaced():
