@@ -235,7 +235,10 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     )
     if displaced := read_displaced(scene):
         name, (right, down) = next(iter(displaced.items()))
-        few = "Their cameras are wrong, or are those of other photographs: move them away, or find their cameras anew."
+        few = (
+            "Their cameras are wrong, or are those of other photographs: move them away, or find their cameras anew, "
+            "unless something hides most of the building there."
+        )
         many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
         console.print(
             "Photographs that do not show the building where the others and their own cameras put it: "

@@ -120,6 +120,7 @@ def check_views(
         inputs = fingerprint(maps.manifest.sources, maps.manifest.max_image_size)[:16]
         compared_with = [view for view in views if view.name not in held_out]
         training = _TrainingViews.of(compared_with, shell, points, maps.folder / f".{inputs}")
+        write_whole(scene / DISPLACED, json.dumps(training.displaced(views, shell), indent=1) + "\n")
 
         def compare(view: View) -> CueMap:
             return training.compare(view, shell.require(view.name, cameras[view.name]))
@@ -128,7 +129,6 @@ def check_views(
             compared = track(pool.map(compare, missing), "Comparing the photographs", len(missing))
             for view, cue in zip(missing, compared, strict=True):
                 maps.write(view.name, cue, cameras[view.name])
-        write_whole(scene / DISPLACED, json.dumps(training.displaced(views, shell), indent=1))
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
