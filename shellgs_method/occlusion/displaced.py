@@ -6,7 +6,6 @@ photographs and poses are not in the same order. Such a photograph spoils the im
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 
+from shellgs_method.files.atomic import read_json
 from shellgs_method.occlusion.exposure import Exposed, points_on_surface, sightings_on_surface
 
 DISPLACED = "cues/checked/displaced.json"
@@ -65,9 +65,13 @@ def displacements(views: Sequence[Exposed], training: Bool[np.ndarray, " V"]) ->
 
 
 def read_displaced(scene: Path) -> dict[str, tuple[int, int]]:
-    """Pixels by which photographs are displaced, by name, the farthest first; empty if that was not looked for."""
+    """Pixels by which photographs are displaced, by name, the farthest first; empty if that was not looked for.
+
+    Raises:
+        SceneError: the file is damaged.
+    """
     path = scene / DISPLACED
-    found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    found = read_json(path) if path.is_file() else {}
     return dict(sorted(found.items(), key=lambda each: -float(np.hypot(*each[1]))))
 
 
