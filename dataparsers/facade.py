@@ -28,6 +28,7 @@ from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
 from shellgs_method.geometry.camera import OPENGL, Camera, positions
 from shellgs_method.geometry.precision import camera_step, warn_of_coarse
+from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.registration.sfm_frame import check_points
 
 ROUNDING = 1e-6
@@ -93,6 +94,8 @@ class FacadeDataParser(DataParser):
         sized = shell or (cues["mono"].manifest if "mono" in cues else None)
         max_image_size = _image_size(config, sized.max_image_size if sized else None)
         whole = _of_split(recording, split, config)
+        if split == "train":
+            whole = _without_wrong_cameras(recording, whole, config.data)
         chosen, cell = _of_block(recording, whole, split, config)
         used = chosen if config.block else range(len(recording.frames))
         there = _on_disk(recording.frames, used, config.data)
@@ -291,19 +294,35 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     return cells
 
 
+def _without_wrong_cameras(recording: Recording, used: Sequence[int], scene: Path) -> list[int]:
+    """Indices of those photographs that are to be trained on: without those that `shellgs cast` found displaced."""
+    wrong = Displaced.read(scene).wrong
+    right = [k for k in used if recording.frames[k].name not in wrong]
+    if left_out := [recording.frames[k].name for k in sorted({*used} - {*right})]:
+        notice(
+            f"{len(left_out)} of {len(used)} photographs of {scene} are not trained on, as their cameras are wrong: "
+            f"{_some(left_out)}. To train on one all the same, take it out of {scene / DISPLACED}."
+        )
+    return right
+
+
 def _on_disk(frames: Sequence[Frame], used: Sequence[int], scene: Path) -> list[int]:
     """Indices of those photographs that are there: a user may take those with wrong cameras out of their folder."""
     there = [k for k in used if frames[k].image.is_file()]
     missing = [frames[k].name for k in sorted({*used} - {*there})]
     if missing:
-        shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         what = f"{len(missing)} of {len(used)} images of the cameras in {scene} are not on disk"
         if len(missing) > max(1, TAKEN_OUT * len(used)):
             raise FileNotFoundError(
-                f"{what} ({shown}); put them back, take them out of the model, or name their folder with --images-path."
+                f"{what} ({_some(missing)}); put them back, take them out of the model, or name their folder with "
+                "--images-path."
             )
-        notice(f"{what}, and are left out: {shown}.")
+        notice(f"{what}, and are left out: {_some(missing)}.")
     return there
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
 
 
 FacadeDataParserSpecification = DataParserSpecification(

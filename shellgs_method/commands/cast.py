@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import time
 from dataclasses import replace
@@ -31,8 +30,6 @@ HOLES = 0.01
 """Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
 GLASS = 0.01
 """Share of the shell behind which photographs agree on something, above which it is hardly all panes of glass."""
-SINGLE = 0.1
-"""Share of the photographs, or two, that are displaced by cameras of their own, and not by the shell's place."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
@@ -220,30 +217,35 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     from shellgs_method.files.sparse_points import find_sparse_points
     from shellgs_method.occlusion import (
         CONTRADICTED_PLACES,
+        DISPLACED,
         MANY,
         UNCLEAR,
+        Displaced,
         check_views,
-        read_displaced,
         shell_verdicts,
     )
 
     views = read_views(config)
-    found = check_views(scene, views, held_out_names(config), find_sparse_points(config))
+    held_out = held_out_names(config)
+    found = check_views(scene, views, held_out, find_sparse_points(config))
     console.print(
         f"Photographs contradict {found.contradicted:.1%} of these pixels: they show an occluder or the background "
         f"({found.checked} views compared, {found.skipped} already there, in {found.seconds:.1f} s)."
     )
-    if displaced := read_displaced(scene):
-        name, (right, down) = next(iter(displaced.items()))
+    if (displaced := Displaced.read(scene)).pixels:
+        name, pixels = displaced.farthest
         few = (
-            "Their cameras are wrong, or are those of other photographs: move them away, or find their cameras anew, "
-            "unless something hides most of the building there."
+            "Their cameras are wrong, or are those of other photographs, unless something hides most of the building "
+            "there: they are not trained on. Find their cameras anew, or take those that are right out of "
+            f"{scene / DISPLACED}."
         )
+        if measured := displaced.wrong & held_out:
+            few += f" What is measured in those that are held out, such as {min(measured)}, says nothing of a method."
         many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
         console.print(
             "Photographs that do not show the building where the others and their own cameras put it: "
-            f"{len(displaced)}, {name} by {math.hypot(right, down):.0f} pixels, for example. "
-            f"{few if len(displaced) <= max(2, SINGLE * len(views)) else many}",
+            f"{len(displaced.pixels)}, {name} by {pixels:.0f} pixels, for example. "
+            f"{few if displaced.wrong else many}",
             style="yellow",
         )
     verdicts = shell_verdicts(scene, views)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import time
 from collections.abc import Collection, Sequence
@@ -38,7 +37,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep,
     sweep_behind,
 )
-from shellgs_method.occlusion.displaced import DISPLACED, displacements
+from shellgs_method.occlusion.displaced import Displaced, displacements
 from shellgs_method.occlusion.exposure import (
     Exposed,
     SurfaceColours,
@@ -58,7 +57,7 @@ COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
 NEARBY = 0.005
 """Share of a view's SfM points on the shell that are so near only if something is: of wrong ones a thousandth is."""
-VERSION = 18
+VERSION = 19
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -90,7 +89,7 @@ def check_views(
     plain or reflecting walls, and where few views overlap.
 
     Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
-    training views contain nothing of the held-out ones.
+    training views contain nothing of the held-out ones. With photographs whose cameras are wrong, nothing is compared.
 
     Args:
         scene: the scene's folder.
@@ -119,8 +118,13 @@ def check_views(
     if missing:
         inputs = fingerprint(maps.manifest.sources, maps.manifest.max_image_size)[:16]
         compared_with = [view for view in views if view.name not in held_out]
-        training = _TrainingViews.of(compared_with, shell, points, maps.folder / f".{inputs}")
-        write_whole(scene / DISPLACED, json.dumps(training.displaced(views, shell), indent=1) + "\n")
+        comparable = _Comparable.of(compared_with, shell, points)
+        displaced = comparable.displaced(views, shell)
+        displaced.write(scene)
+        if displaced.wrong:
+            right = [view for view in compared_with if view.name not in displaced.wrong]
+            comparable = _Comparable.of(right, shell, points)
+        training = _TrainingViews.of(comparable, shell, maps.folder / f".{inputs}")
 
         def compare(view: View) -> CueMap:
             return training.compare(view, shell.require(view.name, cameras[view.name]))
@@ -145,28 +149,22 @@ def compared_others(checked: CueMaps, views: Sequence[View], held_out: Collectio
 
 
 @dataclass(frozen=True)
-class _TrainingViews:
-    """The training views as they are compared, their sweeps, and the colours in front of the shell and on it."""
+class _Comparable:
+    """The training views as they are compared: at their mean exposure, and brightened if there is little light."""
 
     views: dict[str, ShellView]
     surface: SurfaceColours
     """The shell's colours at their mean exposure."""
     light: LowLight
-    sweeps: dict[str, Sweep]
-    colours: ColourModel
-    error: float
-    """Possible error of the shell's place, in scene units; 0 where their size is not known."""
+    points: SparsePoints | None
     windows: bool
     """Whether the shell's model has windows: elsewhere, nothing is seen behind it."""
-    points: SparsePoints | None
 
     @classmethod
-    def of(cls, views: Sequence[View], shell: CueMaps, points: SparsePoints | None, unfinished: Path) -> _TrainingViews:
-        """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
-        size = shell.manifest.max_image_size
+    def of(cls, views: Sequence[View], shell: CueMaps, points: SparsePoints | None) -> _Comparable:
         taken, windows = {}, False
         for view in views:
-            cue = shell.require(view.name, view.camera.shrunk(size))
+            cue = shell.require(view.name, view.camera.shrunk(shell.manifest.max_image_size))
             taken[view.name] = _shell_view(view, cue, points)
             windows |= cue.classes is not None and bool((cue.classes == SurfaceClass.WINDOW).any())
         gains, surface = _gains([_exposed(seen) for seen in taken.values()])
@@ -175,11 +173,47 @@ class _TrainingViews:
         }
         light = LowLight.of(shell_views.values())
         shell_views = {name: light.comparable(seen) for name, seen in shell_views.items()}
-        files = {name: unfinished / f"{index}.npy" for index, name in enumerate(shell_views)}
+        return cls(shell_views, surface, light, points, windows)
+
+    def view(self, view: View, cue: CueMap) -> ShellView:
+        """Any view, likewise."""
+        if view.name in self.views:
+            return self.views[view.name]
+        seen = _shell_view(view, cue, self.points)
+        return self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
+
+    def displaced(self, views: Sequence[View], shell: CueMaps) -> Displaced:
+        """The photographs that do not show the shell where the others do."""
+        size = shell.manifest.max_image_size
+        seen = [self.view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views]
+        found = displacements([_exposed(each) for each in seen], np.array([view.name in self.views for view in views]))
+        pixels = {
+            view.name: np.rint(moved * max(view.camera.width, view.camera.height)).astype(int).tolist()
+            for view, moved in zip(views, found, strict=True)
+            if moved.any()
+        }
+        return Displaced(len(views), pixels)
+
+
+@dataclass(frozen=True)
+class _TrainingViews:
+    """The training views, their sweeps, and the colours in front of the shell and on it."""
+
+    comparable: _Comparable
+    sweeps: dict[str, Sweep]
+    colours: ColourModel
+    error: float
+    """Possible error of the shell's place, in scene units; 0 where their size is not known."""
+
+    @classmethod
+    def of(cls, comparable: _Comparable, shell: CueMaps, unfinished: Path) -> _TrainingViews:
+        """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
+        views = comparable.views
+        files = {name: unfinished / f"{index}.npy" for index, name in enumerate(views)}
         missing = [name for name, file in files.items() if not file.is_file()]
 
         def look(name: str) -> Sweep:
-            return sweep(shell_views[name], [view for other, view in shell_views.items() if other != name])
+            return sweep(views[name], [view for other, view in views.items() if other != name])
 
         unfinished.mkdir(exist_ok=True)
         with workers() as pool:
@@ -189,12 +223,16 @@ class _TrainingViews:
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)
                 write_whole(files[name], content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
-        colours = ColourModel(shell_views.values(), sweeps.values())
-        return cls(shell_views, surface, light, sweeps, colours, _error(shell.manifest), windows, points)
+        return cls(comparable, sweeps, ColourModel(views.values(), sweeps.values()), _error(shell.manifest))
+
+    @property
+    def views(self) -> dict[str, ShellView]:
+        """The views by name."""
+        return self.comparable.views
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
-        seen = self._comparable(view, cue)
+        seen = self.comparable.view(view, cue)
         found = self.sweeps[view.name] if view.name in self.views else sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
@@ -210,30 +248,12 @@ class _TrainingViews:
         confirmed = _resized(found.score.float(), size).numpy() < CONFIRMED
         score_behind, farther = self._behind(seen, size)
         behind = score_behind > REFLECTED
-        solid = cue.classes != SurfaceClass.WINDOW if cue.classes is not None and self.windows else False
+        solid = cue.classes != SurfaceClass.WINDOW if cue.classes is not None and self.comparable.windows else False
         hidden = static | moved | beyond | (behind & solid)
         nearer = _relative_depth(found, size)
         kinds = [static, beyond, moved, behind, confirmed, score > DOUBTFUL]
         depth = cue.depth * np.select(kinds, [nearer, BACKGROUND, 1.0, farther, 1.0, nearer], 0.0)
         return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
-
-    def displaced(self, views: Sequence[View], shell: CueMaps) -> dict[str, list[int]]:
-        """Pixels of the photographs by which those are displaced that do not show the shell where the others do."""
-        size = shell.manifest.max_image_size
-        seen = [self._comparable(view, shell.require(view.name, view.camera.shrunk(size))) for view in views]
-        found = displacements([_exposed(each) for each in seen], np.array([view.name in self.views for view in views]))
-        return {
-            view.name: np.rint(moved * max(view.camera.width, view.camera.height)).astype(int).tolist()
-            for view, moved in zip(views, found, strict=True)
-            if moved.any()
-        }
-
-    def _comparable(self, view: View, cue: CueMap) -> ShellView:
-        """A view at the mean exposure, and brightened as the training views are."""
-        if view.name in self.views:
-            return self.views[view.name]
-        seen = _shell_view(view, cue, self.points)
-        return self.light.comparable(_at_mean_exposure(seen, self.surface.log_gain(_exposed(seen))))
 
     def _behind(
         self, seen: ShellView, size: tuple[int, ...]

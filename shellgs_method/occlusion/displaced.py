@@ -1,12 +1,16 @@
 """Find photographs that show the building elsewhere than their cameras do.
 
 One camera may be wrong where all others are right: structure from motion mistakes one bay of a facade for another, or
-photographs and poses are not in the same order. Such a photograph spoils the images of all that it shows.
+photographs and poses are not in the same order. Such a photograph spoils the images of all that it shows, so it is not
+trained on.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import cv2
@@ -14,21 +18,24 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 
-from shellgs_method.files.atomic import read_json
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import read_json, write_whole
 from shellgs_method.occlusion.exposure import Exposed, points_on_surface, sightings_on_surface
 
 DISPLACED = "cues/checked/displaced.json"
-"""File in the scene's folder: pixels by which photographs are displaced, right and down, by their names."""
+"""File in the scene's folder that has the displaced photographs."""
 GAIN = 0.12
 """Share of its correlation that a displaced photograph gains where it fits best: of those of other poses 94 to 99 % do,
 of those turned by 1 and 2 degrees 77 to 100 and 97 to 100 %. Right ones gain 0.02, and up to 0.113 where the shell is
 30 cm too far forward."""
+FEW = 0.1
+"""Share of the photographs, or two, that are displaced by cameras of their own, and not by the shell's place."""
 LEAST = 0.008
 """Share of the longer side that counts as a displacement: right photographs reach a pixel of 320."""
 _REACH = 0.15  # of the longer side: largest displacement that is tried
 _OTHERS = 2  # photographs that must tell a point's colour, besides the one that is judged
 _SOME = 0.25  # correlation below which a gain is not relative any more: that of chance
-_FEW = 200  # points that tell nothing
+_LITTLE = 200  # points that tell nothing
 _AGREED = 0.4  # best correlation of half of the photographs, below which they agree nowhere, as on mirroring glass
 _MOST = 4_000_000  # projections of points into views
 
@@ -64,15 +71,47 @@ def displacements(views: Sequence[Exposed], training: Bool[np.ndarray, " V"]) ->
     return found if np.median(best) > _AGREED else np.zeros_like(found)
 
 
-def read_displaced(scene: Path) -> dict[str, tuple[int, int]]:
-    """Pixels by which photographs are displaced, by name, the farthest first; empty if that was not looked for.
+@dataclass(frozen=True)
+class Displaced:
+    """The displaced photographs of a scene.
 
-    Raises:
-        SceneError: the file is damaged.
+    Attributes:
+        photographs: number of photographs that were compared.
+        pixels: pixels by which photographs are displaced, right and down, by name.
     """
-    path = scene / DISPLACED
-    found = read_json(path) if path.is_file() else {}
-    return dict(sorted(found.items(), key=lambda each: -float(np.hypot(*each[1]))))
+
+    photographs: int = 0
+    pixels: dict[str, list[int]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, scene: Path) -> Displaced:
+        """Those of a scene; none if it was not looked for them.
+
+        Raises:
+            SceneError: the file is damaged.
+        """
+        path = scene / DISPLACED
+        if not path.is_file():
+            return cls()
+        try:
+            return cls(**read_json(path))
+        except TypeError as error:
+            raise SceneError(f"{path} is damaged: delete {path.parent}, and cast again") from error
+
+    def write(self, scene: Path) -> None:
+        """Store them in the scene."""
+        write_whole(scene / DISPLACED, json.dumps(asdict(self), indent=1) + "\n")
+
+    @property
+    def wrong(self) -> set[str]:
+        """Names of those whose cameras are wrong; none if they are so many that the shell may be."""
+        few = max(FEW * self.photographs, min(2, self.photographs / 4))
+        return set(self.pixels) if len(self.pixels) <= few else set()
+
+    @property
+    def farthest(self) -> tuple[str, float]:
+        """Name of the one that is displaced most, and by how many pixels."""
+        return max(((name, math.hypot(*moved)) for name, moved in self.pixels.items()), key=lambda each: each[1])
 
 
 def _displacement(
@@ -85,7 +124,7 @@ def _displacement(
     row, column = pixels.T[::-1] - reach[:, None]
     middle = size - 2 * reach
     inside = (row >= 0) & (column >= 0) & (row < middle[0]) & (column < middle[1])
-    if inside.sum() < _FEW:
+    if inside.sum() < _LITTLE:
         return (0, 0), 1.0, 1.0
     mask, values = np.zeros((2, *middle), np.float32)
     mask[row[inside], column[inside]] = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from shellgs_method import occlusion
+from dataparsers.facade import FacadeDataParserConfig, held_out_names
+from shellgs_method.errors import SceneError
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.occlusion import read_displaced
+from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.occlusion.displaced import displacements
 from shellgs_method.occlusion.exposure import Exposed
 
@@ -87,22 +89,73 @@ def test_a_plain_photograph_is_not_displaced():
     assert not displacements(views, ALL).any()
 
 
-def test_photographs_of_other_poses_are_told_until_they_are_left_out(shellgs, scene: Path):
+def test_photographs_of_other_poses_are_told_and_not_trained_on(shellgs, scene: Path, caplog):
     assert "their own cameras put it" not in shellgs("cast", scene)
-    assert read_displaced(scene) == {}
+    assert not Displaced.read(scene).pixels
     first, other = sorted((scene / "images").iterdir())[3:6:2]
     first.rename(kept := scene / "kept.png")
     other.rename(first)
     kept.rename(other)
     for _ in range(2):
         told = " ".join(shellgs("cast", scene).split())
-        assert set(read_displaced(scene)) == {f"images/{first.name}", f"images/{other.name}"}
+        assert set(Displaced.read(scene).pixels) == {f"images/{first.name}", f"images/{other.name}"}
         assert "their own cameras put it: 2, images/" in told
-        assert "move them away" in told
+        assert "they are not trained on" in told
+        assert "held out" not in told
+    config = FacadeDataParserConfig(data=scene)
+    names = {path.name for path in config.setup().get_dataparser_outputs("train").image_filenames}
+    assert {path.name for path in (scene / "images").iterdir()} - names == {first.name, other.name} | {
+        Path(name).name for name in held_out_names(config)
+    }
+    assert f"2 of {len(names) + 2} photographs" in caplog.text
 
 
-def test_of_many_displaced_photographs_the_shell_is_told(shellgs, scene: Path, monkeypatch):
-    monkeypatch.setattr(occlusion, "read_displaced", lambda scene: {f"images/{k}.png": (9, 0) for k in range(3)})
+def test_nothing_is_compared_with_a_photograph_of_a_wrong_camera(shellgs, scene: Path):
+    """The other maps are as they are without it."""
+    photographs = sorted((scene / "images").iterdir())
+    photographs[3].write_bytes(photographs[6].read_bytes())
+    shellgs("cast", scene)
+    assert set(Displaced.read(scene).pixels) == {f"images/{photographs[3].name}"}
+    maps = checked(scene)
+    photographs[3].unlink()
+    shutil.rmtree(scene / "cues" / "checked")
+    shellgs("cast", scene)
+    assert not Displaced.read(scene).pixels
+    without = checked(scene)
+    assert set(maps) - set(without) == {f"{photographs[3].name}.npz"}
+    for name, depth in without.items():
+        np.testing.assert_array_equal(depth, maps[name])
+
+
+def checked(scene: Path) -> dict[str, np.ndarray]:
+    """The depth of the maps of what photographs show, by their files' names."""
+    return {path.name: np.load(path)["depth"] for path in (scene / "cues" / "checked").rglob("*.npz")}
+
+
+@pytest.mark.parametrize(("displaced", "count", "left_out"), [(1, 3, 0), (1, 4, 1), (2, 8, 2), (3, 29, 0), (3, 30, 3)])
+def test_of_few_displaced_photographs_the_cameras_are_wrong_of_many_the_shell(displaced, count, left_out):
+    assert len(Displaced(count, {str(k): [9, 0] for k in range(displaced)}).wrong) == left_out
+
+
+def test_what_is_measured_in_a_held_out_photograph_of_a_wrong_camera_is_told_to_say_nothing(shellgs, scene: Path):
+    photographs = sorted((scene / "images").iterdir())
+    photographs[8].write_bytes(photographs[4].read_bytes())
+    told = " ".join(shellgs("cast", scene).split())
+    assert f"held out, such as images/{photographs[8].name}, says nothing of a method" in told
+
+
+@pytest.mark.parametrize("content", ['{"images/0.png": [9, 0]}', '["images/0.png"]', "{"])
+def test_a_damaged_file_of_displaced_photographs_is_refused(tmp_path: Path, content: str):
+    path = tmp_path / DISPLACED
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    with pytest.raises(SceneError, match=r"displaced\.json is damaged"):
+        Displaced.read(tmp_path)
+
+
+def test_of_many_displaced_photographs_the_shell_is_told(shellgs, scene: Path):
+    shellgs("cast", scene)
+    Displaced(10, {f"images/{k}.png": [9, 0] for k in range(3)}).write(scene)
     assert "the shell may not stand where it is built" in " ".join(shellgs("cast", scene).split())
 
 
