@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Shaped
@@ -168,60 +167,42 @@ _Column = tuple[Shaped[np.ndarray, " N"], Shaped[np.ndarray, " M"]]
 """Lengths of the lists of a property, one for each row, and the values of all; of other properties, each is 1."""
 
 
-class _Numbers(Protocol):
-    """The data of a PLY, read from front to back; ``at`` is where, and may be set back."""
+class _Numbers:
+    """The data of a PLY, read from front to back; ``at`` is where, and may be set back.
 
-    at: int
+    Text is read as a binary PLY of doubles.
+    """
+
+    def __init__(self, data: bytes, header: PlyHeader) -> None:
+        self.order, self.at, self.data = header.order, header.length, data
+        if self.order is None:
+            self.data, self.at = numbers_in(data[header.length :].decode("latin-1")).view(np.uint8), 0
 
     def take(self, kind: str, count: int) -> Shaped[np.ndarray, " C"]:
         """The next ``count`` numbers."""
-        ...
+        if count < 0:
+            raise ValueError("it holds a list of negative length")
+        return self.table([kind], count)[0]
 
     def table(self, kinds: list[str], rows: int) -> list[Shaped[np.ndarray, " R"]]:
         """The columns of the next rows, of which each has these types."""
-        ...
-
-
-class _Binary:
-    def __init__(self, data: bytes, order: str, at: int) -> None:
-        self.data, self.order, self.at = data, order, at
-
-    def take(self, kind: str, count: int) -> np.ndarray:
-        if count < 0:
-            raise ValueError("it holds a list of negative length")
-        values = np.frombuffer(self.data, self.order + kind, count, self.at)
-        self.at += values.nbytes
-        return values
-
-    def table(self, kinds: list[str], rows: int) -> list[np.ndarray]:
-        table = np.frombuffer(self.data, [(f"{k}", self.order + kind) for k, kind in enumerate(kinds)], rows, self.at)
-        self.at += table.nbytes
-        return [table[f"{k}"] for k in range(len(kinds))]
-
-
-class _Text:
-    def __init__(self, data: bytes) -> None:
-        self.numbers, self.at = numbers_in(data.decode("latin-1")), 0
-
-    def take(self, kind: str, count: int) -> np.ndarray:
-        values = self.numbers[self.at : self.at + count]
-        if len(values) < count or count < 0:
+        stored = [(f"{k}", "f8" if self.order is None else self.order + kind) for k, kind in enumerate(kinds)]
+        if rows * np.dtype(stored).itemsize > len(self.data) - self.at:
             raise ValueError("it holds fewer numbers than its header claims")
-        self.at += count
-        return values if kind.startswith("f") else values.astype(np.int64)
-
-    def table(self, kinds: list[str], rows: int) -> list[np.ndarray]:
-        table = self.take("f8", rows * len(kinds)).reshape(rows, len(kinds))
-        return [table[:, k] if kind.startswith("f") else table[:, k].astype(np.int64) for k, kind in enumerate(kinds)]
+        table = np.frombuffer(self.data, stored, rows, self.at)
+        self.at += table.nbytes
+        columns = [table[name] for name, _ in stored]
+        if self.order is None:
+            return [c if kind[0] == "f" else c.astype(np.int64) for c, kind in zip(columns, kinds, strict=True)]
+        return columns
 
 
 def _elements(path: Path, header: PlyHeader) -> Iterator[tuple[PlyElement, dict[str, _Column]]]:
-    data, start = path.read_bytes(), header.length
-    numbers: _Numbers = _Text(data[start:]) if header.order is None else _Binary(data, header.order, start)
+    numbers = _Numbers(path.read_bytes(), header)
     for element in header.elements:
         yield element, _columns(element, numbers)
-    if isinstance(numbers, _Text) and numbers.at < len(numbers.numbers):
-        raise ValueError(f"it holds {len(numbers.numbers) - numbers.at} numbers more than its header claims")
+    if header.order is None and (left := len(numbers.data) - numbers.at):
+        raise ValueError(f"it holds {left // 8} numbers more than its header claims")
 
 
 def _columns(element: PlyElement, numbers: _Numbers) -> dict[str, _Column]:
