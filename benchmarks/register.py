@@ -141,7 +141,9 @@ def registered(benchmark: Benchmark, console: Console) -> Iterator[list[str]]:
             before = time.process_time()
             error, verdict, score = np.nan, "refused", ""
             try:
-                placement = place_by_guess(shell.mesh, views, points, ("shell.ply",), shell.metres_per_unit)
+                placement = place_by_guess(
+                    shell.mesh, views, points, Alignment(np.eye(4), ("shell.ply",), shell.metres_per_unit)
+                )
                 found = time.process_time()
                 error = shell.error(placement.alignment)
                 validation = validate(shell.mesh, placement.alignment, views, points).with_checks(placement.checks)

@@ -174,6 +174,8 @@ class _Start:
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str, unit: float
     ) -> Placement:
+        import numpy as np
+
         from shellgs_method.registration import align as by
         from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
@@ -182,16 +184,17 @@ class _Start:
         if not self.shell:
             return by.place_as_before(scene / ALIGNMENT, scene, views)
         names = by.names_in(scene, self.shell)
+        as_it_is = Alignment(np.eye(4), names, unit, source="same frame as the cameras", crs=crs)
         if self.matrix:
             return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
         if self.same_frame:
-            return by.place_as_it_is(names, unit)
+            return by.Placement(as_it_is)
         if self.picks and place:
-            return by.place_by_picks(self.picks, views, place, names, unit, crs)
+            return by.place_by_picks(self.picks, views, place, as_it_is)
         if self.positions and place:
-            return by.place_by_positions(self.positions, views, place, names, unit, crs)
+            return by.place_by_positions(self.positions, views, place, as_it_is)
         mesh = load_shell(*self.shell, cache=scene / "shell", mesher=self.mesher or "planes", metres_per_unit=unit)
-        return by.place_by_guess(mesh, views, points, names, unit, crs)
+        return by.place_by_guess(mesh, views, points, as_it_is)
 
 
 def _check_refinement(is_adjusted: bool, misplacement: str | None) -> None:

@@ -137,11 +137,6 @@ def place_as_before(path: Path, scene: Path, views: Sequence[View]) -> Placement
     return Placement(alignment, history)
 
 
-def place_as_it_is(shells: tuple[str, ...], metres_per_shell_unit: float) -> Placement:
-    """Align a shell that is in the frame and unit of the cameras."""
-    return Placement(Alignment(np.eye(4), shells, metres_per_shell_unit, source="same frame as the cameras"))
-
-
 def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
     """The proposal of a file, which the user accepts.
 
@@ -158,52 +153,44 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
     return Placement(alignment)
 
 
-def place_by_picks(
-    path: Path,
-    views: Sequence[View],
-    place: ShellPlace,
-    shells: tuple[str, ...],
-    metres_per_shell_unit: float,
-    crs: str,
-) -> Placement:
+def place_by_picks(path: Path, views: Sequence[View], place: ShellPlace, unplaced: Alignment) -> Placement:
     """Align the shell by a file of picks.
+
+    Args:
+        path: the file.
+        views: the photographs.
+        place: where the shell is in its own frame.
+        unplaced: the alignment but for its similarity.
 
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: the picks cannot be read, triangulated or trusted, are not in the shell's frame, or less than half
             agree.
     """
-    picks = read_picks(path, views, crs)
+    picks = read_picks(path, views, unplaced.crs)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
-    matrix, picked = align_picks(picks, views, metres_per_shell_unit)
+    matrix, picked = align_picks(picks, views, unplaced.metres_per_shell_unit)
     fitted = [point.is_used for point in picked if point.is_sharp and not point.held_out]
     if 2 * sum(fitted) < len(fitted):
         raise SceneError(
             f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs, which three do by "
             "chance: are they of the same points, and all axes of the shell in one unit?"
         )
-    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
+    alignment = replace(unplaced, shell_to_scene=matrix, source=f"picks in {path.name}")
     return Placement(alignment, [residuals_in_words(picked, "picks")], picked)
 
 
-def place_by_positions(
-    path: Path,
-    views: Sequence[View],
-    place: ShellPlace,
-    shells: tuple[str, ...],
-    metres_per_shell_unit: float,
-    crs: str,
-) -> Placement:
-    """Align the shell by a file of surveyed camera positions.
+def place_by_positions(path: Path, views: Sequence[View], place: ShellPlace, unplaced: Alignment) -> Placement:
+    """Align the shell by a file of surveyed camera positions; arguments are as of :func:`place_by_picks`.
 
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: the positions cannot be read or trusted, or are not in the shell's frame.
     """
-    surveyed = read_positions(path, views, crs)
+    surveyed = read_positions(path, views, unplaced.crs)
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
-    matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
-    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    matrix, cameras, play = align_positions(surveyed, unplaced.metres_per_shell_unit)
+    alignment = replace(unplaced, shell_to_scene=matrix, source=f"camera positions in {path.name}")
     history = [residuals_in_words(cameras, "camera positions")]
     if surveyed.unknown:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
@@ -293,14 +280,7 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
     return replace(placement, correspondences=again, history=[*placement.history, sentence])
 
 
-def place_by_guess(
-    mesh: ShellMesh,
-    views: Sequence[View],
-    points: SparsePoints,
-    shells: tuple[str, ...],
-    metres_per_shell_unit: float,
-    crs: str = "",
-) -> Placement:
+def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints, unplaced: Alignment) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
 
     Where its coordinate reference system is known, geo-tags of the photographs say where to look.
@@ -308,8 +288,8 @@ def place_by_guess(
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
     """
-    surface = ShellSurface(mesh, metres_per_shell_unit)
-    tags = GeoTags.of(views, crs, surface.survey_from_shell) if crs else None
+    surface = ShellSurface(mesh, unplaced.metres_per_shell_unit)
+    tags = GeoTags.of(views, unplaced.crs, surface.survey_from_shell) if unplaced.crs else None
     best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     if tags is not None:
@@ -326,7 +306,7 @@ def place_by_guess(
         name = "Agreement elsewhere, relative to that in place"
         checks.append(check_of("elsewhere", rival.score / best.score, name, "{:.2f}"))
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
-    alignment = Alignment(matrix, shells, metres_per_shell_unit, source="proposal")
+    alignment = replace(unplaced, shell_to_scene=matrix, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
 
 

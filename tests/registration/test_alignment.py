@@ -63,6 +63,11 @@ TRUTH = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
 AXES = SHELL_FROM_BUILDING[:3, :3] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T  # columns: right, up, out
 
 
+def unplaced(shell: str, crs: str = "") -> Alignment:
+    """An alignment of a file, but for its similarity."""
+    return Alignment(np.eye(4), (shell,), crs=crs)
+
+
 @pytest.fixture(scope="module")
 def mesh() -> ShellMesh:
     """The shell of a facade of five bays and three storeys, in national coordinates."""
@@ -215,7 +220,7 @@ def test_points_of_something_else_are_refused(surface, survey_from_scene):
 
 
 def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
-    placement = place_by_guess(mesh, views, points, ("shell/facade.ply",), 1.0)
+    placement = place_by_guess(mesh, views, points, unplaced("shell/facade.ply"))
     found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
     assert placement.proposed
     assert error(surface, found, survey_from_scene) < 0.02
@@ -234,7 +239,7 @@ def turned(axis: str) -> np.ndarray:
 def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
     motion = turned(axis)
     askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
-    alignment = place_by_guess(askew, views, points, ("shell/facade.ply",), 1.0).alignment
+    alignment = place_by_guess(askew, views, points, unplaced("shell/facade.ply")).alignment
     found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
     assert error(surface, found, survey_from_scene) < 0.02
 
@@ -303,13 +308,13 @@ def twins_of(mesh: ShellMesh, metres: float) -> ShellMesh:
 def test_geo_tags_with_a_bias_leave_a_building_and_its_neighbour_ambiguous(tmp_path, mesh, views, points):
     apart = float(np.ptp(mesh.vertices @ AXES[:, 0])) + 0.2
     shown = tagged(tmp_path, views, 1.0, bias=0.75 * apart)
-    placement = place_by_guess(twins_of(mesh, apart), shown, points, ("s.ply",), 1.0, "EPSG:25832")
+    placement = place_by_guess(twins_of(mesh, apart), shown, points, unplaced("s.ply", crs="EPSG:25832"))
     assert any(f"Ambiguous: an alignment {apart:.1f} m from this one" in sentence for sentence in placement.history)
 
 
 def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
     twins = twins_of(mesh, 40)
-    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, ("s.ply",), 1.0, "EPSG:25832")
+    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, unplaced("s.ply", crs="EPSG:25832"))
     assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
     assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
     assert not any("Ambiguous" in sentence for sentence in placement.history)
@@ -380,13 +385,13 @@ def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh,
     monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
     monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
     with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
-        place_by_guess(mesh, views, points, ("shell/facade.glb",), 1.0)
+        place_by_guess(mesh, views, points, unplaced("shell/facade.glb"))
 
 
 @pytest.mark.parametrize("count", [0, 1, 20])
 def test_a_proposal_needs_points(mesh, views, points, count):
     with pytest.raises(SceneError, match="no upright wall to start from: pick points"):
-        place_by_guess(mesh, views, SparsePoints(points.positions[:count]), ("facade.glb",), 1.0)
+        place_by_guess(mesh, views, SparsePoints(points.positions[:count]), unplaced("facade.glb"))
 
 
 def test_a_flat_wall_is_searched_for_in_about_its_size(views):
@@ -423,7 +428,7 @@ def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mes
     building = np.concatenate([wall[~inside], np.repeat(np.array(corners), 10, axis=0)])
     building += random.normal(0, 0.01, building.shape)
     points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
-    history = place_by_guess(mesh, views, points, ("shell/facade.ply",), 1.0).history
+    history = place_by_guess(mesh, views, points, unplaced("shell/facade.ply")).history
     assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)
 
 
