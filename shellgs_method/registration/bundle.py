@@ -21,6 +21,8 @@ _CONVERGED = 1e-8
 """Relative decrease of the cost below which the adjustment has converged."""
 _BEHIND = 1e-6
 """Depth below which a point is behind its camera, and has no error there."""
+_OF_EACH = ("views", "points", "pixels", "weights")
+"""What :class:`Observations` have of each."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,11 @@ class Observations:
     def of_points(self, chosen: Bool[np.ndarray, " N"]) -> Observations:
         """The observations of some of the points, which keep their numbers."""
         kept = chosen[self.points]
-        chosen_of = {name: getattr(self, name)[kept] for name in ("views", "points", "pixels", "weights")}
-        return replace(self, **chosen_of)
+        return replace(self, **{name: getattr(self, name)[kept] for name in _OF_EACH})
 
     def joined(self, other: Observations) -> Observations:
         """These and the other observations, by the same cameras."""
-        names = ("views", "points", "pixels", "weights")
-        return replace(self, **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
+        return replace(self, **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_EACH})
 
 
 @dataclass(frozen=True)
@@ -96,14 +96,9 @@ class Planes:
 
     def joined(self, other: Planes) -> Planes:
         """These and the other planes, by the standard deviation of these."""
-        weights = other.weights * (self.sigma / other.sigma) ** 2
-        return Planes(
-            np.concatenate([self.points, other.points]),
-            np.concatenate([self.normals, other.normals]),
-            np.concatenate([self.feet, other.feet]),
-            np.concatenate([self.weights, weights]),
-            self.sigma,
-        )
+        ours = self.points, self.normals, self.feet, self.weights
+        theirs = other.points, other.normals, other.feet, other.weights * (self.sigma / other.sigma) ** 2
+        return Planes(*map(np.concatenate, zip(ours, theirs, strict=True)), sigma=self.sigma)
 
 
 @dataclass(frozen=True)
@@ -141,7 +136,7 @@ class Objective:
 
     def cost(self, bundle: Bundle) -> float:
         """Value of the objective."""
-        return _linearised(self, bundle, derivatives=False).cost
+        return _residuals(self, bundle)[-1]
 
 
 @dataclass
@@ -160,10 +155,12 @@ class _Linearised:
 class _Reprojection:
     """Errors by their standard deviation, weights and costs of observations, and derivatives of the errors.
 
-    Errors and derivatives of points behind their camera are 0.
+    Errors and weights of points that are not in front of their camera are 0. Derivatives are by the place of the point
+    inside its camera's frame, and by the parameters of the lens.
     """
 
     error: np.ndarray
+    front: np.ndarray
     weight: np.ndarray
     cost: np.ndarray
     inside: np.ndarray
@@ -173,99 +170,87 @@ class _Reprojection:
     @classmethod
     def of(cls, objective: Objective, bundle: Bundle) -> _Reprojection:
         seen, scale = objective.observations, objective.cauchy**2
-        error, front, inside, by_inside, by_lens = _project(bundle, seen)
+        rotations = bundle.rotations[seen.views]
+        inside = np.einsum("mij,mj->mi", rotations, bundle.points[seen.points] - bundle.centres[seen.views])
+        front = inside[:, 2] > _BEHIND
+        depth = np.where(front, inside[:, 2], 1.0)
+        rays = inside[:, :2] / depth[:, None]
+        lens = seen.lens_of[seen.views]
+        pixels, by_ray, by_lens = np.zeros((len(rays), 2)), np.zeros((len(rays), 2, 2)), np.zeros((len(rays), 2, 10))
+        for fisheye in np.unique(seen.fisheye):
+            of = seen.fisheye[lens] == fisheye
+            pixels[of], by_ray[of], by_lens[of] = to_pixels(rays[of], bundle.lenses[lens[of]], bool(fisheye))
+        by_inside = np.concatenate([by_ray, -np.einsum("mij,mj->mi", by_ray, rays)[..., None]], axis=2)
+        by_inside /= depth[:, None, None]
+        error = np.where(front[:, None], pixels - seen.pixels, 0.0)
         error, by_inside, by_lens = (each / objective.pixel for each in (error, by_inside, by_lens))
         squared = (error**2).sum(axis=1)
         weight = np.where(front, seen.weights / (1 + squared / scale), 0.0)
-        return cls(error, weight, 0.5 * scale * seen.weights * np.log1p(squared / scale), inside, by_inside, by_lens)
+        cost = 0.5 * scale * seen.weights * np.log1p(squared / scale)
+        return cls(error, front, weight, cost, inside, by_inside, by_lens)
 
 
 def reprojection_errors(
     bundle: Bundle, observations: Observations
 ) -> tuple[Float64[np.ndarray, "M 2"], Bool[np.ndarray, " M"]]:
     """Projected less observed pixels, and which points are in front of their camera; the error of others is 0."""
-    error, front, *_ = _project(bundle, observations)
-    return error, front
+    at = _Reprojection.of(Objective(observations), bundle)
+    return at.error, at.front
 
 
-def _project(bundle: Bundle, seen: Observations) -> tuple[np.ndarray, ...]:
-    """Errors, which are in front, points in the camera, derivatives of pixels by these and by lenses."""
-    rotations = bundle.rotations[seen.views]
-    inside = np.einsum("mij,mj->mi", rotations, bundle.points[seen.points] - bundle.centres[seen.views])
-    front = inside[:, 2] > _BEHIND
-    depth = np.where(front, inside[:, 2], 1.0)
-    rays = inside[:, :2] / depth[:, None]
-    lens = seen.lens_of[seen.views]
-    pixels, by_ray, by_lens = np.zeros((len(rays), 2)), np.zeros((len(rays), 2, 2)), np.zeros((len(rays), 2, 10))
-    for fisheye in np.unique(seen.fisheye):
-        of = seen.fisheye[lens] == fisheye
-        pixels[of], by_ray[of], by_lens[of] = to_pixels(rays[of], bundle.lenses[lens[of]], bool(fisheye))
-    by_inside = np.concatenate([by_ray, -np.einsum("mij,mj->mi", by_ray, rays)[..., None]], axis=2)
-    by_inside /= depth[:, None, None]
-    error = np.where(front[:, None], pixels - seen.pixels, 0.0)
-    return error, front, inside, by_inside, by_lens
-
-
-def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) -> _Linearised:
-    seen, planes, known = objective.observations, objective.planes, objective.positions
-    at = _Reprojection.of(objective, bundle)
+def _residuals(objective: Objective, bundle: Bundle) -> tuple[_Reprojection, np.ndarray, np.ndarray, float]:
+    """Errors of the observations, distances from planes and positions, and the cost of all."""
+    planes, known, at = objective.planes, objective.positions, _Reprojection.of(objective, bundle)
     distance = np.einsum("kj,kj->k", planes.normals, bundle.points[planes.points] - planes.feet)
-    stiffness = planes.weights / planes.sigma**2
     away = bundle.centres[known.views] - known.centres
-    cost = at.cost.sum() + 0.5 * (stiffness * distance**2).sum() + 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
-    if not derivatives:
-        empty = np.empty(0)
-        return _Linearised(float(cost), empty, sparse.csr_matrix((0, 0)), empty, empty, empty)
+    of_planes = 0.5 * (planes.weights / planes.sigma**2 * distance**2).sum()
+    of_positions = 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
+    return at, distance, away, float(at.cost.sum() + of_planes + of_positions)
 
+
+def _linearised(objective: Objective, bundle: Bundle) -> _Linearised:
+    seen, planes, known = objective.observations, objective.planes, objective.positions
+    at, distance, away, cost = _residuals(objective, bundle)
     root = np.sqrt(at.weight)[:, None, None]
-    by_inside = at.by_inside * root
+    by_inside, error = at.by_inside * root, at.error[..., None] * root
     by_point = by_inside @ bundle.rotations[seen.views]
     # Turning the camera by the vector w moves a point x in its frame by w x x.
     by_turn = np.cross(at.inside[:, None], by_inside)
+    by_pose = np.concatenate([by_turn, -by_point], axis=2)
     lens = seen.lens_of[seen.views]
     by_lens = np.einsum("mij,mjp->mip", at.by_lens * root, seen.free[lens])
-    by_pose = np.concatenate([by_turn, -by_point], axis=2)
-    error = at.error[..., None] * root
 
-    cameras, count = len(bundle.centres), len(bundle.points)
-    width = seen.free.shape[2]
-    of_view, of_lens, of_point = (
-        _sum_by(index, size)
-        for index, size in ((seen.views, cameras), (lens, len(bundle.lenses)), (seen.points, count))
-    )
-    split = 6 * cameras
-    Hcc = np.zeros((split + width * len(bundle.lenses),) * 2)
-    pose = np.arange(split).reshape(-1, 6)
-    focal = split + np.arange(width * len(bundle.lenses)).reshape(-1, width)
-    Hcc[pose[:, :, None], pose[:, None]] = _blocks(of_view, by_pose, by_pose)
-    Hcc[focal[:, :, None], focal[:, None]] = _blocks(of_lens, by_lens, by_lens)
-    mixed = _blocks(of_view, by_pose, by_lens)
-    Hcc[pose[:, :, None], focal[seen.lens_of][:, None]] = mixed
-    Hcc[focal[seen.lens_of][:, :, None], pose[:, None]] = mixed.transpose(0, 2, 1)
-    gc = np.concatenate([_blocks(of_view, by_pose, error).ravel(), _blocks(of_lens, by_lens, error).ravel()])
-    gx = _blocks(of_point, by_point, error)[..., 0]
-    Hxx = _blocks(of_point, by_point, by_point)
-    Hcx = sparse.csr_matrix(
-        sparse.vstack(
-            [
-                _mixed(by_pose, by_point, seen.views, cameras, seen.points, count),
-                _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count),
-            ]
-        )
-    )
+    cameras, lenses, count = len(bundle.centres), len(bundle.lenses), len(bundle.points)
+    Hpp, Hpl, gp = _blocks(seen.views, cameras, by_pose, by_pose, by_lens, error)
+    Hll, gl = _blocks(lens, lenses, by_lens, by_lens, error)
+    Hxx, gx = _blocks(seen.points, count, by_point, by_point, error)
+    poses = np.arange(6 * cameras).reshape(-1, 6)
+    own = 6 * cameras + np.arange(gl.size).reshape(lenses, -1)
+    of_view = own[seen.lens_of]
+    Hcc = np.zeros((6 * cameras + own.size,) * 2)
+    Hcc[poses[:, :, None], poses[:, None]] = Hpp
+    Hcc[own[:, :, None], own[:, None]] = Hll
+    Hcc[poses[:, :, None], of_view[:, None]] = Hpl
+    Hcc[of_view[:, :, None], poses[:, None]] = Hpl.transpose(0, 2, 1)
+    gc, gx = np.concatenate([gp.ravel(), gl.ravel()]), gx[..., 0]
+    of_poses = _mixed(by_pose, by_point, seen.views, cameras, seen.points, count)
+    of_lenses = _mixed(by_lens, by_point, lens, lenses, seen.points, count)
+    Hcx = sparse.csr_matrix(sparse.vstack([of_poses, of_lenses]))
 
+    stiffness = planes.weights / planes.sigma**2
     np.add.at(Hxx, planes.points, stiffness[:, None, None] * planes.normals[:, :, None] * planes.normals[:, None])
     np.add.at(gx, planes.points, (stiffness * distance)[:, None] * planes.normals)
     diagonal = 6 * known.views[:, None] + np.arange(3, 6)
     np.add.at(Hcc, (diagonal, diagonal), 1 / known.sigma[:, None] ** 2)
     np.add.at(gc, diagonal, away / known.sigma[:, None] ** 2)
-    return _Linearised(float(cost), Hcc, Hcx, Hxx, gc, gx)
+    return _Linearised(cost, Hcc, Hcx, Hxx, gc, gx)
 
 
-def _blocks(summed: sparse.csr_matrix, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Sums of the products of derivatives (observation, pixel coordinate, unknown), over observations of the same."""
-    products = np.matmul(one.transpose(0, 2, 1), other)
-    return (summed @ products.reshape(len(products), -1)).reshape(-1, *products.shape[1:])
+def _blocks(index: np.ndarray, count: int, one: np.ndarray, *others: np.ndarray) -> list[np.ndarray]:
+    """Products of derivatives (observation, pixel coordinate, unknown), summed over observations of the same index."""
+    summed = sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (count, len(index)))
+    products = (np.matmul(one.transpose(0, 2, 1), other) for other in others)
+    return [(summed @ each.reshape(len(each), -1)).reshape(-1, *each.shape[1:]) for each in products]
 
 
 def _mixed(
@@ -353,7 +338,7 @@ def intersected(objective: Objective, bundle: Bundle, steps: int = 20) -> Bundle
     damping, cost = np.full(len(bundle.points), 1e-3), _point_costs(objective, bundle)
     for _ in range(steps):
         Hxx, gx = _of_points(objective, bundle)
-        step = np.linalg.solve(_damped(Hxx, damping[:, None, None]), gx[..., None])[..., 0]
+        step = np.linalg.solve(_damped(Hxx, damping[:, None, None]), gx)[..., 0]
         trial = replace(bundle, points=bundle.points - step)
         costs = _point_costs(objective, trial)
         better = costs < cost
@@ -366,23 +351,17 @@ def intersected(objective: Objective, bundle: Bundle, steps: int = 20) -> Bundle
     return bundle
 
 
-def _of_points(objective: Objective, bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
+def _of_points(objective: Objective, bundle: Bundle) -> list[np.ndarray]:
     """Hessian and gradient of the reprojection errors by each point."""
     seen, at = objective.observations, _Reprojection.of(objective, bundle)
     by_point = at.by_inside @ bundle.rotations[seen.views]
-    summed = _sum_by(seen.points, len(bundle.points))
     weighed = at.weight[:, None, None] * by_point
-    return _blocks(summed, weighed, by_point), _blocks(summed, weighed, at.error[..., None])[..., 0]
+    return _blocks(seen.points, len(bundle.points), weighed, by_point, at.error[..., None])
 
 
 def covariances(objective: Objective, bundle: Bundle) -> Float64[np.ndarray, "N 3 3"]:
     """Covariance of each triangulated point, the cameras being exact."""
     return np.linalg.inv(_damped(_of_points(objective, bundle)[0], 0.0))
-
-
-def _sum_by(index: np.ndarray, count: int) -> sparse.csr_matrix:
-    """The matrix that sums rows with the same index."""
-    return sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (count, len(index)))
 
 
 def _damped(blocks: np.ndarray, damping: float | np.ndarray) -> np.ndarray:
