@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from shellgs_method.blocks import WEAK
-from shellgs_method.blocks.walls import REACH, areas, end_of_walls, extent, middle_of_street
+from shellgs_method.blocks.walls import REACH, Walls
 from shellgs_method.files.blocks import Block, Blocks, Cut, Fork
 from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
@@ -123,19 +123,19 @@ def cut(
         held_out: names of the photographs that are held out, of which each block has one.
     """
     length, overlap = seen.metres * length, seen.metres * overlap
-    area, share = areas(seen.points), 1 / np.bincount(seen.views)[seen.views]
+    walls, share = Walls.of(seen.points), 1 / np.bincount(seen.views)[seen.views]
 
     def split(of: Int64[np.ndarray, " M"]) -> Fork | Block:
-        points = seen.points[of]
-        along, low, high = extent(points, area[of])
+        part = walls[of]
+        along, low, high = part.extent()
         parts = round(share[of].sum() / photographs if photographs else (high - low) / length)
         if parts < 2 or high - low < 2 * REACH:
             return Block("", ())
         step = (high - low) / parts
-        at, through = end_of_walls(points, area[of], along, low + step * (parts // 2), step / 2)
-        if through > THROUGH and (street := middle_of_street(points, area[of], along)):
+        at, through = part.end(along, low + step * (parts // 2), step / 2)
+        if through > THROUGH and (street := part.middle_of_street(along)):
             along, at = street
-        above = points @ along >= at
+        above = part.points @ along >= at
         plane = Cut((float(along[0]), float(along[1]), float(along[2])), at)
         return Fork(plane.moved(seen.to_scene), split(of[~above]), split(of[above]))
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views, trainable_cells
 from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, assumed_metres, cut, tracked
-from shellgs_method.blocks.walls import areas, end_of_walls
+from shellgs_method.blocks.walls import Walls
 from shellgs_method.commands.blocks import blocks as command
 from shellgs_method.errors import SceneError
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
@@ -163,7 +163,7 @@ def test_a_facade_is_not_parted_from_its_panes_by_a_cut_along_it():
     facade = np.stack([np.where(np.mod(y, 3) < 1.5, 20.0, 20.25), y, z], axis=1)
     points = np.concatenate([along, facade, row((20.3, 40), (0,), (10,))])
     direction = np.array([1.0, 0.0, 0.0])
-    place = end_of_walls(points, areas(points), direction, 20.1, 8.0)
+    place = Walls.of(points).end(direction, 20.1, 8.0)
     assert len(np.unique(facade @ direction >= place.at)) == 1
 
 
