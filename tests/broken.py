@@ -24,9 +24,9 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints, read_sparse_points
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration import validate
 from shellgs_method.registration.picks import align_picks, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
+from shellgs_method.registration.validation import validate
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell
 
 SECONDS = 20

@@ -24,7 +24,7 @@ from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses.objective import ExtraLossConfig, SelfLosses
-from shellgs_method.registration import validate
+from shellgs_method.registration.validation import validate
 from shellgs_method.render.maps import Geometry
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
