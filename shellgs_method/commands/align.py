@@ -246,8 +246,7 @@ def _written(
         bound = replace(validation, alignment=validation.alignment.bound(scene, views))
         validation, unit = with_unit(bound, mesh, views)
         validated = replace(validation.alignment, verdict=validation.verdict, metrics=validation.metrics())
-        told = filter(None, [up_in_words(validated), unit])
-        placement = replace(placement, history=[*placement.history, *told])
+        placement = placement.then(*filter(None, [up_in_words(validated), unit]))
         write_report(scene / REPORT, mesh, validation, placement.history)
         if validation.verdict != "refused":
             if candidate.is_dir():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -119,6 +119,10 @@ class Placement:
     correspondences: Sequence[Correspondence] = ()
     proposed: bool = False
     checks: Sequence[Check] = ()
+
+    def then(self, *sentences: str, **changes: Any) -> Placement:
+        """The placement after a further step: what is other, and what the report says of it."""
+        return replace(self, history=[*self.history, *sentences], **changes)
 
 
 def place_as_before(path: Path, scene: Path, views: Sequence[View]) -> Placement:
@@ -245,7 +249,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
             f"The cameras are left as they are: {held.points} points near the shell, held out of their adjustment, "
             f"{why}."
         )
-        return replace(placement, history=[*placement.history, sentence]), None
+        return placement.then(sentence), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
     moved, deviation = (100 * np.array([*by.values()]) for by in (adjustment.moved, adjustment.deviations))
     sentence = (
@@ -257,7 +261,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     found = replace(
         alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
     )
-    return replace(placement, alignment=found, history=[*placement.history, sentence]), adjustment
+    return placement.then(sentence, alignment=found), adjustment
 
 
 def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) -> Placement:
@@ -277,7 +281,7 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
         f"In the adjusted cameras, the points are {after:.3f} m off (root mean square of all, check points too), "
         f"{before:.3f} m before."
     )
-    return replace(placement, correspondences=again, history=[*placement.history, sentence])
+    return placement.then(sentence, correspondences=again)
 
 
 def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints, unplaced: Alignment) -> Placement:
@@ -353,9 +357,5 @@ def refined(
         sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."
     matrix = np.linalg.inv(result.survey_from_scene) @ surface.survey_from_shell
     moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined")
-    return replace(
-        placement,
-        alignment=moved,
-        history=[*placement.history, sentence],
-        correspondences=measured_again(placement.correspondences, moved),
-    )
+    again = measured_again(placement.correspondences, moved)
+    return placement.then(sentence, alignment=moved, correspondences=again)
