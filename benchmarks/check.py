@@ -22,7 +22,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-from shellgs_method.files.cue_maps import CueMaps, Findings
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.occlusion import check_views
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views

@@ -16,7 +16,8 @@ from dataparsers.cameras import pinhole_camera, pinhole_cameras
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap, Findings
 from shellgs_method.files.photographs import View, has_alpha, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera
 

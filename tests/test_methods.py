@@ -21,7 +21,8 @@ import method_configs
 from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.runs import PAPER
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.gaussians.initial import OPACITY
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights

@@ -19,8 +19,8 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
 from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.errors import SceneError
-from shellgs_method.files.cue_maps import CueMap, CueMaps
-from shellgs_method.files.map_files import resampled
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap, resampled
 from shellgs_method.runs.limits import check_settings
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 

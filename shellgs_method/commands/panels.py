@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from shellgs_method.files.cue_maps import CueMap, CueMaps
+    from shellgs_method.files.cue_maps import CueMaps
+    from shellgs_method.files.map_files import CueMap
     from shellgs_method.files.photographs import View
 
 

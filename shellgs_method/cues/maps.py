@@ -17,8 +17,8 @@ from shellgs_method.cues.source import Predictor
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
-from shellgs_method.files.cue_maps import CueMap, CueMaps
-from shellgs_method.files.map_files import is_number
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap, is_number
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.machine.progress import track

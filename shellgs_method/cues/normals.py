@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 
 from shellgs_method.evaluation.geometry import angular_error
-from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
 

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.axes import facade_axes, likely_up
 from shellgs_method.geometry.camera import Camera

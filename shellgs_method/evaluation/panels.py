@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from shellgs_method.evaluation.colours import CLASS_COLOURS, GREY, normal_colours
-from shellgs_method.files.cue_maps import CueMap, Findings
+from shellgs_method.files.map_files import CueMap, Findings
 from shellgs_method.geometry.surface_classes import SurfaceClass
 
 FINDINGS = (

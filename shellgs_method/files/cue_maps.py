@@ -25,7 +25,6 @@ from shellgs_method.files.map_files import (
     FORMAT,
     UNREADABLE,
     CueMap,
-    Findings,
     MapRecord,
     damage,
     difference,
@@ -38,19 +37,6 @@ from shellgs_method.files.map_files import (
 )
 from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.camera import Camera
-
-__all__ = [
-    "CueMap",
-    "CueMaps",
-    "Findings",
-    "Manifest",
-    "MapRecord",
-    "find_cues",
-    "map_path",
-    "relative_path",
-    "source_hash",
-    "tolerated",
-]
 
 T = TypeVar("T")
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
-from shellgs_method.files.map_files import BACKGROUND
+from shellgs_method.files.cue_maps import CueMaps, Manifest, tolerated
+from shellgs_method.files.map_files import BACKGROUND, CueMap
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.surface_classes import SurfaceClass

@@ -13,7 +13,8 @@ import trimesh
 from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.files.atomic import write_whole
-from shellgs_method.files.cue_maps import CueMaps, Findings
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.surface_classes import SurfaceClass

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from shellgs_method.files.atomic import write_whole
-from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import project

@@ -15,7 +15,8 @@ from scipy.ndimage import grey_opening
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, source_hash
+from shellgs_method.files.cue_maps import CueMaps, source_hash
+from shellgs_method.files.map_files import CueMap, Findings
 from shellgs_method.files.paths import photographs_in
 from shellgs_method.files.photographs import View, has_alpha, load_mask
 from shellgs_method.files.scene import ALIGNMENT, TRUTH

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, UInt8
 
-from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass

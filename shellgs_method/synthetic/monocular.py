@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import gaussian_filter
 
-from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.files.map_files import CueMap
 
 EDGES = 1 / 160  # of the image's width: standard deviation of the blur of edges
 PATCHES = 1 / 10  # of the image's width: size of the smooth errors

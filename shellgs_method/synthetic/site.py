@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.synthetic.appearance import Daylight, rays
 from shellgs_method.synthetic.frames import UNITS_PER_METRE

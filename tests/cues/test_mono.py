@@ -27,7 +27,8 @@ from shellgs_method.cues.normals import Convention, decoded, disagreement, facin
 from shellgs_method.cues.source import Prediction, Predictor
 from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints, read_sparse_points
 from shellgs_method.geometry.camera import Camera

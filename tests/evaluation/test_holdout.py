@@ -9,7 +9,8 @@ from training_runs import data_of, model_of, trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE
 

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.files.cue_maps import CueMap, CueMaps, relative_path
+from shellgs_method.files.cue_maps import CueMaps, relative_path
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.geometry.camera import Camera
 
 HEIGHT, WIDTH = 12, 16

@@ -27,8 +27,8 @@ from shellgs_method.evaluation import Rendering, pixels
 from shellgs_method.evaluation.panels import check_panel
 from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
 from shellgs_method.evaluation.regions import reference_errors, regions
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
-from shellgs_method.files.map_files import BACKGROUND
+from shellgs_method.files.cue_maps import CueMaps, Manifest
+from shellgs_method.files.map_files import BACKGROUND, CueMap, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.transfer import DARK, POWER

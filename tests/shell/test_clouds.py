@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.clouds import merged
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.points import Points
 from shellgs_method.files.surfaces import read_geometry

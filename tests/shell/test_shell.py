@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.panels import supervision_panel
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, ShellCaster, ShellMesh, cast_views, load_shell

@@ -15,7 +15,8 @@ from PIL import Image
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import measure_shell
 from shellgs_method.errors import SceneError
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import CueMap, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.geometry.camera import Camera
