@@ -85,40 +85,29 @@ def propose(
         SceneError: the SfM points have no main wall, or it fits nowhere.
     """
     samples, triangle = surface.samples(_SAMPLES)
-    normals = surface.normals[triangle]
-    spread = samples[:200]
     cameras = positions(view.camera for view in views)
     near = _most(points.positions)
     axes = scene_axes(near, cameras, scene_up)
     sight = Sightlines.of(views, points)
+    fit = _Fit(surface, np.random.default_rng(0).permutation(near), sight, samples[:200])
     search = _Search.of(samples, near, sight)
-    turns = [to.T @ axes for to in shell_axes(normals)]
-    starts: list[Candidate] = []
-    for turn in track(turns, "Trying orientations", len(turns)):
-        starts += search.placed(turn)
+    turns = [to.T @ axes for to in shell_axes(surface.normals[triangle])]
+    starts = [start for turn in track(turns, "Trying orientations", len(turns)) for start in search.placed(turn)]
     if tags is not None:
         agreeing = [start for start in starts if tags.apart(start.survey_from_scene) < 3 * REACH]
         starts, tags = (agreeing, tags) if agreeing else (starts, None)
-    starts = _distinct(starts, spread, _MEASURED, search.cell)
-    starts = [
-        replace(start, score=sight.agreement(surface, start.survey_from_scene, _ROUGH))
-        for start in track(starts, "Measuring candidates", len(starts))
-    ]
-    shuffled = np.random.default_rng(0).permutation(near)
+    starts = fit.distinct(starts, _MEASURED, search.cell)
+    starts = [fit.measured(s.survey_from_scene, _ROUGH) for s in track(starts, "Measuring candidates", len(starts))]
     for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
-        starts = _distinct(starts, spread, count, apart * search.cell)
+        starts = fit.distinct(starts, count, apart * search.cell)
         starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
-        starts = [
-            refined
-            for start in track(starts, f"Refining candidates, round {number}", len(starts))
-            for refined in _refined(surface, shuffled[:few], sight, start, reach * search.cell, _COARSE, steps)
-        ]
+        hopeful = track(starts, f"Refining candidates, round {number}", len(starts))
+        starts = [found for s in hopeful for found in fit.refined(s, few, reach * search.cell, _COARSE, steps)]
     different = max([_DIFFERENT, *(_DIFFERENT_FROM_AFAR * sight.distance(s.survey_from_scene) for s in starts[:1])])
-    starts = _distinct(starts, spread, _POLISHED, different)
+    starts = fit.distinct(starts, _POLISHED, different)
     polished = []
     for start in track(starts, "Refining the best", len(starts)):
-        reach = 2 * _COARSE * sight.distance(start.survey_from_scene)
-        polished += _refined(surface, shuffled[:_MANY], sight, start, reach, _FIT, 30)
+        polished += fit.refined(start, _MANY, 2 * _COARSE * sight.distance(start.survey_from_scene), _FIT, 30)
     polished = [candidate for candidate in polished if candidate.score > 0]
     if not polished:
         size = float(np.ptp(surface.vertices, axis=0).max())
@@ -131,8 +120,8 @@ def propose(
         least = AMBIGUOUS * max(candidate.score for candidate in polished)
         nearest = min(off for off, candidate in zip(apart, polished, strict=True) if candidate.score >= least)
         polished = [candidate for off, candidate in zip(apart, polished, strict=True) if off <= nearest + REACH]
-    best, *others = _distinct(polished, spread, _POLISHED, different)
-    return [best, *(replace(other, displacement=_displacement(best, other, spread)) for other in others)]
+    best, *others = fit.distinct(polished, _POLISHED, different)
+    return [best, *(replace(other, displacement=fit.displacement(best, other)) for other in others)]
 
 
 @dataclass(frozen=True)
@@ -214,47 +203,64 @@ def _peaks(score: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
         score[tuple(slice(max(i - 2, 0), i + 3) for i in index)] = -np.inf
 
 
-def _refined(
-    surface: ShellSurface,
-    points: np.ndarray,
-    sight: Sightlines,
-    start: Candidate,
-    reach: float,
-    tolerance: float,
-    steps: int,
-) -> list[Candidate]:
-    """The candidate refined from an error of ``reach`` metres, and measured; none if too few points are in reach."""
-    last = max(FINAL_GATE, tolerance * sight.distance(start.survey_from_scene))
-    far = tolerance > _FIT
-    try:
-        found = refine(surface, points, start.survey_from_scene, reach, last=last, steps=steps, relative=far)
-    except SceneError:
-        return []
-    return [Candidate(found.survey_from_scene, sight.agreement(surface, found.survey_from_scene, tolerance))]
+@dataclass(frozen=True)
+class _Fit:
+    """How candidates are measured, refined and told from each other.
 
+    Attributes:
+        surface: the shell.
+        points: SfM points, in random order.
+        sight: sightlines to them.
+        spread: some points of the shell, by which it is seen how far candidates are apart.
+    """
 
-def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int, apart: float) -> list[Candidate]:
-    """Up to ``count`` candidates, best first, each the best of those less than ``apart`` metres from it."""
-    best = sorted(candidates, key=lambda candidate: -candidate.score)
-    # Where the shell is in the scene, relative to the size of it there: shells of all scales are compared alike.
-    placed = [transformed(spread, np.linalg.inv(candidate.survey_from_scene)) for candidate in best]
-    metres = [scale_of(candidate.survey_from_scene) for candidate in best]
-    kept: list[int] = []
-    for k in range(len(best)):
-        if kept:
-            moved = np.linalg.norm(np.stack([placed[other] for other in kept]) - placed[k], axis=2).mean(axis=1)
-            if (moved * metres[k] <= apart).any():
-                continue
-        kept.append(k)
-        if len(kept) == count:
-            break
-    return [best[k] for k in kept]
+    surface: ShellSurface
+    points: np.ndarray
+    sight: Sightlines
+    spread: np.ndarray
 
+    def measured(self, similarity: np.ndarray, tolerance: float) -> Candidate:
+        return Candidate(similarity, self.sight.agreement(self.surface, similarity, tolerance))
 
-def _displacement(one: Candidate, other: Candidate, spread: np.ndarray) -> float:
-    """Mean displacement of the shell between two candidates, in metres."""
-    moved = transformed(spread, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
-    return float(np.linalg.norm(moved - spread, axis=1).mean())
+    def refined(self, start: Candidate, few: int, reach: float, tolerance: float, steps: int) -> list[Candidate]:
+        """The candidate refined from an error of ``reach`` metres, and measured; none if too few points are in reach.
+
+        Args:
+            start: the candidate.
+            few: how many of the points are looked at.
+            reach: its error in metres.
+            tolerance: relative to the distance, of the last step.
+            steps: most steps.
+        """
+        last = max(FINAL_GATE, tolerance * self.sight.distance(start.survey_from_scene))
+        points, far = self.points[:few], tolerance > _FIT
+        try:
+            found = refine(self.surface, points, start.survey_from_scene, reach, last=last, steps=steps, relative=far)
+        except SceneError:
+            return []
+        return [self.measured(found.survey_from_scene, tolerance)]
+
+    def distinct(self, candidates: Sequence[Candidate], count: int, apart: float) -> list[Candidate]:
+        """Up to ``count`` candidates, best first, each the best of those less than ``apart`` metres from it."""
+        best = sorted(candidates, key=lambda candidate: -candidate.score)
+        # Where the shell is in the scene, relative to the size of it there: shells of all scales are compared alike.
+        placed = [transformed(self.spread, np.linalg.inv(candidate.survey_from_scene)) for candidate in best]
+        metres = [scale_of(candidate.survey_from_scene) for candidate in best]
+        kept: list[int] = []
+        for k in range(len(best)):
+            if kept:
+                moved = np.linalg.norm(np.stack([placed[other] for other in kept]) - placed[k], axis=2).mean(axis=1)
+                if (moved * metres[k] <= apart).any():
+                    continue
+            kept.append(k)
+            if len(kept) == count:
+                break
+        return [best[k] for k in kept]
+
+    def displacement(self, one: Candidate, other: Candidate) -> float:
+        """Mean displacement of the shell between two candidates, in metres."""
+        moved = transformed(self.spread, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
+        return float(np.linalg.norm(moved - self.spread, axis=1).mean())
 
 
 def _most(points: np.ndarray) -> np.ndarray:

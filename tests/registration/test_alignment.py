@@ -383,7 +383,7 @@ def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh,
     """As a shell in millimetres gives, if taken for one in metres."""
     unsupported = [Candidate(np.eye(4), score=0.0)]
     monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
-    monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
+    monkeypatch.setattr(proposal._Fit, "refined", lambda *_: unsupported)
     with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
         place_by_guess(mesh, views, points, unplaced("shell/facade.glb"))
 
