@@ -176,7 +176,7 @@ def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, M
     files = NamedFiles(scene, images_path, scene / folder)
     names = {number: _path(image.name, files) for number, image in _images(scene / folder).items()}
     if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return _points([], [], [], []), names
+        return _points([]), names
     return _read(scene / folder, "points3D", _binary_points, _text_points), names
 
 
@@ -428,31 +428,27 @@ def _are_keypoints(line: str) -> bool:
 
 
 def _binary_points(file: _Bytes) -> Points:
-    positions, colours, tracks, ids = [], [], [], []
+    rows = []
     for _ in file.records():
         number, *known, _, count = file.take("<Q3d3BdQ")
-        ids.append(number)
-        positions.append(known[:3])
-        colours.append(known[3:])
-        tracks.append(file.array("<i4", 2 * count).astype(np.int64))
-    return _points(positions, colours, tracks, ids)
+        rows.append((number, known[:3], known[3:], file.array("<i4", 2 * count).astype(np.int64)))
+    return _points(rows)
 
 
 def _text_points(lines: Iterator[str]) -> Points:
-    positions, colours, tracks, ids = [], [], [], []
+    rows = []
     for words in map(str.split, lines):
         position = [float(word) for word in words[1:4]]
         colour = [_whole(word) for word in words[4:7]]
         if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
             raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
-        ids.append(int(words[0]))
-        positions.append(position)
-        colours.append(colour)
-        tracks.append(np.array(words[8:], dtype=np.int64))
-    return _points(positions, colours, tracks, ids)
+        rows.append((int(words[0]), position, colour, np.array(words[8:], dtype=np.int64)))
+    return _points(rows)
 
 
-def _points(positions: list, colours: list, tracks: list, ids: list) -> Points:
+def _points(rows: list[tuple[int, list, list, np.ndarray]]) -> Points:
+    """Points of their numbers, positions, colours and tracks: image and keypoint of one observation after another."""
+    ids, positions, colours, tracks = zip(*rows, strict=True) if rows else ((),) * 4
     return Points(
         np.array(positions, dtype=np.float64).reshape(-1, 3),
         np.array(colours, dtype=np.uint8).reshape(-1, 3),
