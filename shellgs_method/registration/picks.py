@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import write_whole
@@ -253,25 +253,16 @@ def align_picks(
     Raises:
         SceneError: a point cannot be triangulated, or fewer than 3 points off one line can be trusted.
     """
-    scene, reprojection, worst_view, sharp, pixels = _triangulate_all(picks, views)
-    candidates = sharp & ~np.array([pick.held_out for pick in picks])
-    shell = np.stack([pick.shell for pick in picks])
+    by_name = {view.name: view for view in views}
+    found = [triangulated(pick, by_name) for pick in picks]
+    shell, scene = np.stack([pick.shell for pick in picks]), np.stack([one.point for one in found])
+    candidates = np.array([one.is_sharp and not pick.held_out for pick, one in zip(picks, found, strict=True)])
+    pixels = np.array([one.pixel for one in found])
     fit = fit_robustly(shell, scene, candidates, metres_per_shell_unit, "picks", "pick a point beside it", pixels)
+    known = zip(fit.used.tolist(), fit.residuals.tolist(), fit.left_out.tolist(), strict=True)
     points = [
-        PickedPoint(
-            pick.name,
-            pick.shell,
-            scene[k],
-            pick.held_out,
-            bool(fit.used[k]),
-            float(fit.residuals[k]),
-            float(fit.left_out[k]),
-            reprojection[k],
-            worst_view[k],
-            bool(sharp[k]),
-            tuple(pick.pixels),
-        )
-        for k, pick in enumerate(picks)
+        PickedPoint(pick.name, pick.shell, one.point, pick.held_out, *of, *one.worst, one.is_sharp, tuple(pick.pixels))
+        for pick, one, of in zip(picks, found, known, strict=True)
     ]
     return fit.shell_to_scene, worst_first(points)
 
@@ -284,12 +275,12 @@ def picked_again(
     Raises:
         SceneError: a pick cannot be triangulated.
     """
-    scene, reprojection, worst_view, *_ = _triangulate_all(picks, views)
-    found = {pick.name: k for k, pick in enumerate(picks)}
+    by_name = {view.name: view for view in views}
+    found = {pick.name: triangulated(pick, by_name) for pick in picks}
     moved = []
-    for point in points:
-        k = found[point.name]
-        moved.append(replace(point, scene=scene[k], reprojection=reprojection[k], worst_view=worst_view[k]))
+    for point, one in ((point, found[point.name]) for point in points):
+        reprojection, view = one.worst
+        moved.append(replace(point, scene=one.point, reprojection=reprojection, worst_view=view))
     return measured_again(moved, alignment)
 
 
@@ -323,6 +314,12 @@ class Triangulation:
     is_sharp: bool
     pixel: float
 
+    @property
+    def worst(self) -> tuple[float, str]:
+        """The largest reprojection error, in pixels, and the view's name."""
+        name = max(self.errors, key=lambda name: self.errors[name])
+        return self.errors[name], name
+
 
 def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
     """Triangulate a pick from its photographs.
@@ -352,14 +349,3 @@ def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
     depths = viewmats[:, 2, :3] @ point + viewmats[:, 2, 3]
     errors = dict(zip(pick.pixels, error.tolist(), strict=True))
     return Triangulation(point, errors, bool((error <= limits).all()), float(np.median(depths / Ks[:, 0, 0])))
-
-
-def _triangulate_all(
-    picks: Sequence[Pick], views: Sequence[View]
-) -> tuple[np.ndarray, list[float], list[str], Bool[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-    by_name = {view.name: view for view in views}
-    found = [triangulated(pick, by_name) for pick in picks]
-    worst_view = [max(one.errors, key=lambda name: one.errors[name]) for one in found]
-    reprojection = [max(one.errors.values()) for one in found]
-    sharp, pixels = np.array([one.is_sharp for one in found]), np.array([one.pixel for one in found])
-    return np.stack([one.point for one in found]), reprojection, worst_view, sharp, pixels
