@@ -53,7 +53,7 @@ from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.capture.work import Work, listing, refuse_foreign
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
-from shellgs_method.files.locks import held
+from shellgs_method.files.locks import alone_in
 from shellgs_method.files.paths import PHOTOGRAPHS, RAW
 from shellgs_method.files.scene import CAPTURE
 
@@ -167,9 +167,7 @@ class _Capture:
     def run(self) -> Summary:
         self._refuse_to_overwrite()
         self.work = Work(self.scene / CAPTURE)
-        with held(self.work.folder) as alone:
-            if not alone:
-                raise SceneError(f"another capture of {self.scene} is going on: wait for it")
+        with alone_in(self.work.folder, f"another capture of {self.scene} is going on: wait for it"):
             if not self.work.has("undistorted", self.model_key) or self._missing_parts():
                 self._photographs()
                 database = self._features()

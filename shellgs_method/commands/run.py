@@ -27,7 +27,7 @@ from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, fingerprint, read_json, write_whole
-from shellgs_method.files.locks import held
+from shellgs_method.files.locks import alone_in
 from shellgs_method.files.scene import ALIGNMENT
 
 if TYPE_CHECKING:
@@ -175,9 +175,7 @@ def run(
     recipe = _settled(recipe, scene.with_name(f"{scene.name}.run"))
     results = scene.with_name(f"{scene.name}-results")
     steps = _Steps(results / "steps", total=5 + recipe.sim)
-    with held(steps.folder) as alone:
-        if not alone:
-            raise SceneError(f"another run of {scene} is going on: wait for it")
+    with alone_in(steps.folder, f"another run of {scene} is going on: wait for it"):
         if not steps.changed("all", *_state(recipe, scene, results)):
             (trained,) = (results / "runs").glob(f"*/*/{recipe.method}/*/config.yml")
             console.print("Nothing is left to do.")

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from shellgs_method.bounds import TINY, Bounds, FromOne, Jobs, Seed, bounded
 from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch
 from shellgs_method.commands.merge import report_seams
-from shellgs_method.errors import SceneError, check_output_folder
+from shellgs_method.errors import check_output_folder
 
 
 @bounded
@@ -46,14 +46,12 @@ def street(
     check_output_folder(output)
     from shellgs_method.blocks.merge import check_free, merge
     from shellgs_method.blocks.street import Street, script, train
-    from shellgs_method.files.locks import held
+    from shellgs_method.files.locks import alone_in
 
     plan = Street.plan(scene, method, iterations, coarse_iterations, coarse_scale, seed, output, paths)
     check_free(plan.merged)
     output.mkdir(parents=True, exist_ok=True)
-    with held(output) as alone:
-        if not alone:
-            raise SceneError(f"another command is at work in {output}: wait for it, or give another --output")
+    with alone_in(output, f"another command is at work in {output}: wait for it, or give another --output"):
         if launcher == "script":
             if lines := script(plan):
                 print(*lines, sep="\n")

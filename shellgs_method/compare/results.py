@@ -18,7 +18,7 @@ from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.tables import rich_table
 from shellgs_method.files.atomic import write_whole
-from shellgs_method.files.locks import held
+from shellgs_method.files.locks import alone_in
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finish runs; return those that failed, with the reason."""
@@ -51,9 +51,7 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
         SceneError: a run has other settings, or another comparison is running here; raised before anything starts.
     """
     output.mkdir(parents=True, exist_ok=True)
-    with held(output) as alone:
-        if not alone:
-            raise SceneError(f"another comparison is running in {output}: wait for it, or give another --output")
+    with alone_in(output, f"another comparison is running in {output}: wait for it, or give another --output"):
         return _compare(runs, launch, output, console)
 
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from shellgs_method.errors import SceneError
+
 try:
     import fcntl
 except ImportError:  # Windows, where nothing is locked
@@ -22,6 +24,19 @@ def claimed(folder: Path) -> bool:
     if folder not in _CLAIMED and _LOCKS.enter_context(held(folder)):
         _CLAIMED.add(folder)
     return folder in _CLAIMED
+
+
+@contextmanager
+def alone_in(folder: Path, otherwise: str) -> Iterator[None]:
+    """Lock a folder while the context lasts.
+
+    Raises:
+        SceneError: ``otherwise``, as another process has it.
+    """
+    with held(folder) as alone:
+        if not alone:
+            raise SceneError(otherwise)
+        yield
 
 
 @contextmanager
