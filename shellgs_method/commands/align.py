@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, table
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, table, warn
 from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
@@ -272,7 +272,7 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
             residuals.add_row(*row)
         console.print(residuals)
     for reason in validation.reasons:
-        console.print(f"{reason}.", style="yellow")
+        warn(f"{reason}.")
     if validation.verdict == "refused":
         return
     report = scene / REPORT / "index.html"

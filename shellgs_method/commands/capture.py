@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from shellgs_method.capture.config import CaptureConfig
-from shellgs_method.commands.common import Scene, console
+from shellgs_method.commands.common import Scene, console, warn
 
 _CAPTURE = CaptureConfig()
 
@@ -41,9 +41,8 @@ def capture(
     if summary.missing:
         console.print(f"Not registered: {', '.join(summary.missing)}.")
     if summary.reprojection_error > SUSPICIOUS_ERROR:
-        console.print(
+        warn(
             f"More than {SUSPICIOUS_ERROR:g} px is a sign that identical windows were confused. Look at the "
             f"cameras in {scene}/colmap: if their path jumps or folds, try --overlap 5 (sequential), more --frames, or "
             "--masks.",
-            style="yellow",
         )

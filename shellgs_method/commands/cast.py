@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import FromOne, Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, shell_words
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, shell_words, warn
 from shellgs_method.commands.panels import save_panel, views_with_maps
 from shellgs_method.errors import SceneError
 
@@ -147,18 +147,16 @@ def _cast_shell(
     )
     if summary.supported < SELDOM:
         hint = frame_of_matrix(config) if matrix else ""
-        console.print(
+        warn(
             f"Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
             f"{f'; {hint}' if hint else ''}.",
-            style="yellow",
         )
     if placed.mesh.meshing and (through := seen_through(scene, views)) > HOLES:
         poisson = f"`shellgs align {shlex.quote(str(scene))} … --mesher poisson` closes most"
         remedy = "a denser scan is needed" if alignment.mesher == "poisson" else poisson
-        console.print(
+        warn(
             f"{through:.1%} of these pixels show what is far behind, through holes of a few pixels in the mesh. Where "
             f"the building has none, as in a round wall, {remedy}.",
-            style="yellow",
             soft_wrap=True,
         )
 
@@ -198,8 +196,7 @@ def _cast_truth(
         f"In the median, the two are {metres:.3f} m apart there."
     )
     if covered < LITTLE or not metres < FAR_OFF:
-        doubt = "Is it of this building, and in the shell's frame? Look before you believe its metrics."
-        console.print(doubt, style="yellow")
+        warn("Is it of this building, and in the shell's frame? Look before you believe its metrics.")
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
 
 
@@ -242,11 +239,10 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         if measured := displaced.wrong & held_out:
             few += f" What is measured in those that are held out, such as {min(measured)}, says nothing of a method."
         many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
-        console.print(
+        warn(
             "Photographs that do not show the building where the others and their own cameras put it: "
             f"{len(displaced.pixels)}, {name} by {pixels:.0f} pixels, for example. "
             f"{few if displaced.wrong else many}",
-            style="yellow",
         )
     verdicts = shell_verdicts(scene, views)
     places = scene / CONTRADICTED_PLACES
@@ -258,11 +254,10 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
             "differs."
         )
     if verdicts.behind.share > GLASS:
-        console.print(
+        warn(
             f"Behind {verdicts.behind.share:.1%} of the shell, as many photographs show something else: look at "
             f"{verdicts.views[verdicts.behind.witness]}, and at {places}, magenta there. If that is no glass, the "
             "building lacks this part of the shell, or stands back: take it out of the shell.",
-            style="yellow",
         )
     if verdicts.moved_in:
         console.print(
@@ -270,10 +265,9 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
             f"{len(verdicts.moved_in)}, mostly {verdicts.moved_in[0]}; shellgs-metric leaves it out."
         )
     if verdicts.unclear > UNCLEAR:
-        console.print(
+        warn(
             f"Photographs tell little of {verdicts.unclear:.0%} of these pixels, as where they are dark or noisy: the "
             "shell is doubted there, and supervises with less weight.",
-            style="yellow",
         )
     panel = _save_check_panel(scene, views)
     console.print(

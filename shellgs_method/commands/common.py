@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Without a terminal rich assumes 80 columns, which cut the tables of a log. Its markup would swallow a folder's [name],
 # and its colours would single out numbers in the midst of names and paths.
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160, markup=False, highlight=False)
+warn = partial(console.print, style="yellow")
 
 # tyro takes an empty list of files too, and its help would say (default: ).
 required = partial(tyro.conf.arg, help_behavior_hint="(required)")

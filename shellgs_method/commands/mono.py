@@ -7,7 +7,7 @@ from typing import Annotated, Optional, Union
 import tyro
 
 from shellgs_method.bounds import FromOne, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.commands.common import PATHS, Paths, Scene, console, warn
 from shellgs_method.commands.panels import save_panel
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
@@ -52,7 +52,7 @@ def mono(
     licence = f", licence {predictor.licence}" if predictor.licence else ""
     console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.")
     if predictor.non_commercial:
-        console.print("The licence of these weights forbids commercial use.", style="yellow")
+        warn("The licence of these weights forbids commercial use.")
     if points.observed is None:
         console.print("The scene does not say which points a view observes: all points that project into it are used.")
     size = f" --max-image-size {max_image_size}" if max_image_size else ""

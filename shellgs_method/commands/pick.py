@@ -10,7 +10,7 @@ from typing import Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import Length, Port, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console, required, shell_words
+from shellgs_method.commands.common import PATHS, Paths, Scene, console, required, shell_words, warn
 from shellgs_method.errors import SceneError
 
 
@@ -80,7 +80,7 @@ def pick(
     said = session.said()
     for point in said["points"]:
         if point["problem"] and not point["left_out"]:
-            console.print(f"{point['problem']}.", style="yellow", soft_wrap=True)
+            warn(f"{point['problem']}.", soft_wrap=True)
     fit = said["fit"]
     if "problem" in fit:
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", soft_wrap=True)

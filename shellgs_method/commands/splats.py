@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Optional
 
 from shellgs_method.bounds import Bounds, Length, bounded
-from shellgs_method.commands.common import RunConfig, console, place
+from shellgs_method.commands.common import RunConfig, console, place, warn
 
 MOST_LEVELS = 32
 """Most levels of detail that are written."""
@@ -85,4 +85,4 @@ def _tell_of_others(output: Path, levels: int) -> None:
     """Tell of files that are named as further levels: an earlier command's, or the user's, so they are kept."""
     further = (output.with_stem(f"{output.stem}-{number}") for number in range(levels, MOST_LEVELS))
     if others := ", ".join(path.name for path in further if path.exists()):
-        console.print(f"Not of these levels, and left as before: {others}.", style="yellow")
+        warn(f"Not of these levels, and left as before: {others}.")
