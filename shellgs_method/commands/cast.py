@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from dataparsers.facade import FacadeDataParserConfig
     from shellgs_method.files.photographs import View
+    from shellgs_method.occlusion.verdicts import Verdicts
     from shellgs_method.shell import Alignment
 
 # None if not given: of a variable that is empty, tyro makes an empty tuple.
@@ -212,15 +213,7 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.facade import held_out_names, read_views
     from shellgs_method.files.sparse_points import find_sparse_points
-    from shellgs_method.occlusion import (
-        CONTRADICTED_PLACES,
-        DISPLACED,
-        MANY,
-        UNCLEAR,
-        Displaced,
-        check_views,
-        shell_verdicts,
-    )
+    from shellgs_method.occlusion import CONTRADICTED_PLACES, DISPLACED, Displaced, check_views, shell_verdicts
 
     views = read_views(config)
     held_out = held_out_names(config)
@@ -241,12 +234,23 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
         warn(
             "Photographs that do not show the building where the others and their own cameras put it: "
-            f"{len(displaced.pixels)}, {name} by {pixels:.0f} pixels, for example. "
-            f"{few if displaced.wrong else many}",
+            f"{len(displaced.pixels)}, {name} by {pixels:.0f} pixels, for example. {few if displaced.wrong else many}"
         )
-    verdicts = shell_verdicts(scene, views)
-    places = scene / CONTRADICTED_PLACES
+    verdicts, places = shell_verdicts(scene, views), scene / CONTRADICTED_PLACES
     verdicts.write(places)
+    _tell_of_verdicts(verdicts, places)
+    panel = _save_check_panel(scene, views)
+    console.print(
+        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background, orange "
+        "what is behind a wall, magenta what windows show behind it, cyan where it is doubted; they confirm what is "
+        "green."
+    )
+
+
+def _tell_of_verdicts(verdicts: Verdicts, places: Path) -> None:
+    """Print what photographs together say against the shell, whose places are drawn in a file."""
+    from shellgs_method.occlusion import MANY, UNCLEAR
+
     if verdicts.before.share > 0:
         console.print(
             f"{verdicts.before.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those "
@@ -269,12 +273,6 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
             f"Photographs tell little of {verdicts.unclear:.0%} of these pixels, as where they are dark or noisy: the "
             "shell is doubted there, and supervises with less weight.",
         )
-    panel = _save_check_panel(scene, views)
-    console.print(
-        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background, orange "
-        "what is behind a wall, magenta what windows show behind it, cyan where it is doubted; they confirm what is "
-        "green."
-    )
 
 
 def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:
