@@ -143,6 +143,7 @@ class FacadePipeline(VanillaPipeline):
         Damaged ones, and those of another ``sh_degree`` or ``exposure`` than the settings', end the program with a
         message.
         """
+        trained_on = [*loaded_state.get("_extra_state", {}).get("cameras", {})]
         with refusals_end_the_program():
             try:
                 check_gaussians(loaded_state)
@@ -155,11 +156,13 @@ class FacadePipeline(VanillaPipeline):
                         f"the checkpoint's {name} are of shape {list(stored.shape)}, where these settings (sh_degree) "
                         f"give {list(parameter.shape)}: load it with the settings that it was trained with"
                     )
-            self._check_exposures(loaded_state.get("_model.exposures.parameter"))
+            self._check_exposures(loaded_state.get("_model.exposures.parameter"), trained_on)
         super().load_pipeline(loaded_state, step)
-        self._find_exposures([*loaded_state.get("_extra_state", {}).get("cameras", {})])
+        self._find_exposures(trained_on)
+        if self.test_mode == "val":
+            self._tell_of_held_out(trained_on)
 
-    def _check_exposures(self, stored: Tensor | None) -> None:
+    def _check_exposures(self, stored: Tensor | None, trained_on: Sequence[str]) -> None:
         ours = self.model.exposures
         if (stored is None) != (ours is None):
             has, setting = ("no", "fixed") if stored is None else ("the", "learned")
@@ -167,10 +170,24 @@ class FacadePipeline(VanillaPipeline):
                 f"the checkpoint has {has} exposures of its photographs: load it with "
                 f"--pipeline.model.exposure {setting}"
             )
-        if stored is not None and ours is not None and self.test_mode == "val" and len(stored) != len(ours.parameter):
+        if stored is None or ours is None or self.test_mode != "val":
+            return
+        names = [stem(view.name) for view in self.datamanager.train_dataset.views]
+        count = len(ours.parameter)  # of the whole scene, where a block is trained
+        if len(stored) != count or [*map(stem, trained_on)] not in ([], names):
             raise SceneError(
-                f"the checkpoint has exposures of {len(stored)} photographs, and the scene has "
-                f"{len(ours.parameter)} to train on: train on the same photographs, or anew"
+                f"the checkpoint has exposures of {len(stored)} photographs, which are not the {count} that the scene "
+                "has to train on: train on the same photographs, or anew"
+            )
+
+    def _tell_of_held_out(self, trained_on: Sequence[str]) -> None:
+        """Tell of photographs that are held out now, and were not before the checkpoint."""
+        data, trained = self.datamanager, {*map(stem, trained_on)}
+        trained -= {stem(view.name) for view in data.train_dataset.views}
+        if known := [view.name for view in data.eval_dataset.views if stem(view.name) in trained]:
+            notice(
+                f"{len(known)} of the held-out photographs, {known[0]} for example, were trained on until this "
+                "checkpoint, and their metrics will be too good: hold out those that it had held out, or train anew."
             )
 
     def _find_exposures(self, trained_on: Sequence[str]) -> None:

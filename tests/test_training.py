@@ -401,6 +401,20 @@ def test_a_run_is_not_resumed_over_other_cameras(pristine_scene, tmp_path):
         trainer_of(scene, tmp_path / "second", "photo_gs", 6, first.checkpoint_dir)
 
 
+@pytest.mark.parametrize(("interval", "told"), [(8, False), (9, True)])
+def test_held_out_photographs_that_the_checkpoint_was_trained_on_are_told(
+    pristine_scene, tmp_path, caplog, interval, told
+):
+    def others(config):
+        config.pipeline.datamanager.dataparser.eval_interval = interval
+
+    first = trainer_of(pristine_scene, tmp_path / "first", "photo_gs", iterations=2)
+    first.train()
+    trainer_of(pristine_scene, tmp_path / "second", "photo_gs", 4, first.checkpoint_dir, others)
+    words = "1 of the held-out photographs, images/frame_00010.png for example, were trained on until this checkpoint"
+    assert (words in caplog.text) is told
+
+
 def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_path):
     again = trainer_of(pristine_scene, tmp_path, iterations=60, load_dir=trained.checkpoint_dir)
     again.train()
