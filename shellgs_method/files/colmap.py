@@ -167,17 +167,18 @@ def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
     return Recording(in_order(frames, str(scene / folder)), APPLIED, listed)
 
 
-def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, Mapping[int, str]]:
-    """Read the points of a model (none without a file of points) and the names of its photographs by id.
+def read_points(scene: Path, folder: Path, images_path: Path) -> Model:
+    """Read a model with its points (none without a file of them), its photographs named by their paths in the scene.
 
     Raises:
+        FileNotFoundError: another file of the model is missing.
         SceneError: a file is damaged.
     """
     files = NamedFiles(scene, images_path, scene / folder)
-    names = {number: _path(image.name, files) for number, image in _images(scene / folder).items()}
-    if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return _points([]), names
-    return _read(scene / folder, "points3D", _binary_points, _text_points), names
+    images = {k: image._replace(name=_path(image.name, files)) for k, image in _images(scene / folder).items()}
+    there = any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt"))
+    points = _read(scene / folder, "points3D", _binary_points, _text_points) if there else _points([])
+    return Model(_read(scene / folder, "cameras", _binary_cameras, _text_cameras), images, points)
 
 
 def read_model(folder: Path) -> Model:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -34,12 +35,15 @@ class SparsePoints:
             transforms.json.
         colours: RGB, where known.
         called: the points and their file, for messages.
+        features: where each view observes these points, in shares of the photograph's width and height before it is
+            undistorted; NaN where that is unknown.
     """
 
     positions: Float64[np.ndarray, "N 3"]
     observed: Mapping[str, Int[np.ndarray, " M"]] | None = None
     colours: UInt8[np.ndarray, "N 3"] | None = None
     called: str = "the SfM points"
+    features: Mapping[str, Float64[np.ndarray, "M 2"]] = field(default_factory=dict)
 
     @cached_property
     def step(self) -> Step:
@@ -90,15 +94,38 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
         kept = _sound(positions, layout)
         called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
         return _warned(SparsePoints(positions[kept], None, colours[kept], called), layout)
-    points, names = colmap.read_points(layout.data, folder, layout.images_path)
+    model = colmap.read_points(layout.data, folder, layout.images_path)
+    points, images = model.points, model.images
     kept = _sound(points.positions, layout)
-    observed: dict[str, list[int]] = {name: [] for name in names.values()}
+    observed: dict[int, dict[int, int]] = {number: {} for number in images}  # points and their keypoints
     for index, point in enumerate(kept):
-        for image in set(points.observers[point].tolist()) & names.keys():
-            observed[names[image]].append(index)
+        for image, keypoint in zip(points.observers[point].tolist(), points.keypoints[point].tolist(), strict=False):
+            if image in images:
+                observed[image][index] = keypoint
     positions, colours = points.positions[kept], points.colours[kept]
-    seen = {name: np.array(of, dtype=int) for name, of in observed.items()} if any(observed.values()) else None
-    return _warned(SparsePoints(positions, seen, colours, f"the SfM points of {layout.data / folder}"), layout)
+    called = f"the SfM points of {layout.data / folder}"
+    if not any(observed.values()):
+        return _warned(SparsePoints(positions, None, colours, called), layout)
+    seen = {images[k].name: np.array(list(of), dtype=int) for k, of in observed.items()}
+    features = {images[k].name: _features(model, k, list(of.values())) for k, of in observed.items()}
+    return _warned(SparsePoints(positions, seen, colours, called, features), layout)
+
+
+def _features(model: colmap.Model, number: int, keypoints: list[int]) -> Float64[np.ndarray, "M 2"]:
+    """Where a photograph of a model has these of its keypoints, in shares of its width and height.
+
+    NaN where that is unknown, or all are in one place, as of scripts that write some, as the format wants them.
+    """
+    image, numbers = model.images[number], np.array(keypoints, dtype=int)
+    found = np.full((len(numbers), 2), np.nan)
+    with suppress(ValueError):  # they are damaged
+        pixels = image.features["xy"]
+        there = (numbers >= 0) & (numbers < len(pixels))
+        found[there] = pixels[numbers[there]]
+        if len(pixels) and not np.ptp(pixels, axis=0).any():
+            found[:] = np.nan
+    camera = model.cameras.get(image.camera)
+    return found / [camera.width or np.nan, camera.height or np.nan] if camera else found * np.nan
 
 
 def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:

@@ -227,7 +227,8 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     used = [point for point in placement.correspondences if point.is_used]
     picks = [point for point in used if isinstance(point, PickedPoint)]
     surveyed = [point for point in used if not isinstance(point, PickedPoint)]
-    _, names = read_points(layout.data, folder, layout.images_path)
+    images = read_points(layout.data, folder, layout.images_path).images
+    names = {number: image.name for number, image in images.items()}
     known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
     scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
     adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter, picks)

@@ -22,7 +22,9 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
-from shellgs_method.geometry.camera import OPENGL, Camera, in_view, positions
+from shellgs_method.files.undistortion import distort_pixels
+from shellgs_method.geometry.camera import OPENGL, Camera, in_view, positions, project
+from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.spread import spread
 
 UNITS = {
@@ -55,6 +57,7 @@ intensities in grey, 5 and more for those in colours and for classes."""
 _SEEN, _ALIKE = 0.5, 0.4
 _UNSEEN, _HARDLY, _WELL, _UNLIKE = 0.02, 0.1, 0.8, 0.15
 _SPECK = 1e-4  # of the extent of the cameras, which is nothing that could be trained on
+_DRIFTED = 0.01  # of a photograph's sides: points of 450 models are within .003 of their keypoints in the median
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
 
 
@@ -175,7 +178,8 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
             "cameras and points from one program, in one frame"
         )
     seen, alike, away = sight.seen(sight.points), sight.alike(sight.points), sight.away(sight.points)
-    if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE:
+    drift = sight.drift(sight.points)
+    if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE and drift <= _DRIFTED:
         return
     apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
     remedy = "export cameras and points from one program, in one frame"
@@ -191,7 +195,13 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
             f"{points.called} are not in the frame of the cameras: {apart}, which neither other axes nor another unit "
             f"explain, but a shift or a rotation; {remedy}"
         )
-    if alike < _UNLIKE or seen < _ALIKE:
+    if drift > _DRIFTED:
+        notice(
+            f"{points.called} are not where the photographs show them, by their own tracks, but {drift:.1%} of a "
+            "photograph's side away in the median: cameras, images and points are of several models, or were changed "
+            "apart from each other; give the files of one."
+        )
+    elif alike < _UNLIKE or seen < _ALIKE:
         colours = ", and they have other colours than the photographs there" if alike < _UNLIKE else ""
         notice(f"{points.called} may be in another frame than the cameras: {apart}{colours}; if so, {remedy}.")
 
@@ -206,6 +216,10 @@ class _Sight:
     photographs: Sequence[tuple[Camera, Float64[np.ndarray, "H W 3"]]]
     observed: Sequence[Int[np.ndarray, " M"]] | None = None
     """Indices of the points that each camera observes, where tracks tell."""
+    features: Sequence[Float64[np.ndarray, "M 2"]] = (np.empty((0, 2)),)
+    """Where they do, in shares of the photograph's sides; NaN where that is unknown."""
+    lenses: Sequence[Lens | None] = ()
+    """The distortion of each camera, if it has any."""
 
     @classmethod
     def of(cls, points: SparsePoints, views: Sequence[View]) -> _Sight:
@@ -217,11 +231,17 @@ class _Sight:
         photographs = [photograph for view in shown for photograph in _small(view)]
         if not may_be_of(colours, [image for _, image in photographs]):
             photographs = []
-        observed = None
-        if points.observed is not None:
-            numbers = np.arange(len(points.positions))
-            observed = [np.flatnonzero(np.isin(some, numbers[points.of(view)])) for view in views]
-        return cls(points.positions[some], colours, [view.camera for view in views], photographs, observed)
+        cameras, lenses = [view.camera for view in views], [view.lens for view in views]
+        sight = cls(points.positions[some], colours, cameras, photographs, lenses=lenses)
+        if points.observed is None:
+            return sight
+        observed, features = [], []
+        for view in views:
+            _, of_some, of_view = np.intersect1d(some, np.asarray(points.of(view)), return_indices=True)
+            observed.append(of_some)
+            known = points.features.get(view.name)
+            features.append(np.full((len(of_view), 2), np.nan) if known is None else known[of_view])
+        return replace(sight, observed=observed, features=features)._scaled()
 
     def seen(self, points: np.ndarray) -> float:
         """Share of the points that a camera sees; each of many cameras may see a small part of a street.
@@ -238,6 +258,36 @@ class _Sight:
             if len(unseen) == 0:
                 break
         return 1 - len(unseen) / len(points)
+
+    def drift(self, points: np.ndarray) -> float:
+        """How far points are from where the photographs show them, in the median, in shares of the sides of these.
+
+        0 where too few tracks tell.
+        """
+        missed = np.linalg.norm(self._projected(points) - np.concatenate(self.features), axis=1)
+        known = missed[~np.isnan(missed)]
+        return float(np.median(known)) if len(known) >= _OBSERVATIONS else 0.0
+
+    def _projected(self, points: np.ndarray) -> Float64[np.ndarray, "O 2"]:
+        """Projections of the points observed, in shares of the photographs' sides; infinite behind the camera."""
+        found = [np.empty((0, 2))]
+        for camera, lens, of in zip(self.cameras, self.lenses, self.observed or (), strict=False):
+            pixels, depth = project(camera, points[of])
+            if lens is not None:
+                pixels = distort_pixels(lens, pixels, camera.K.double().cpu().numpy())
+            sized = lens or camera
+            found.append(np.where(depth[:, None] > 0, pixels / [sized.width, sized.height], np.inf))
+        return np.concatenate(found)
+
+    def _scaled(self) -> _Sight:
+        """The same; if the features are of photographs of another size, and only cameras were scaled, at this one."""
+        projected, features = self._projected(self.points), np.concatenate(self.features)
+        known = np.isfinite(projected).all(axis=1) & (features > 0).all(axis=1)
+        if known.sum() < _OBSERVATIONS:
+            return self
+        scale = np.median(projected[known] / features[known], axis=0)
+        scaled = replace(self, features=[scale * each for each in self.features])
+        return scaled if scaled.drift(self.points) < min(_DRIFTED, self.drift(self.points) / 2) else self
 
     def alike(self, points: np.ndarray) -> float:
         """Correlation of the points' colours with those of the photographs, in each; NaN if too few are compared."""
@@ -262,7 +312,7 @@ class _Sight:
     def explanation(self, seen: float, away: float) -> Slip | None:
         """The mistake whose correction gives the most likeness; without colours, one that brings them into view."""
         if not self.photographs:
-            return first_slip(self.points, self._in_view) if seen < self._hardly or away > _FAR else None
+            return first_slip(self.points, self._in_view) if self._unseen(seen) or away > _FAR else None
         found = [(self.alike(slip.corrected(self.points)), slip) for slip in slips()]
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
         return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
@@ -271,7 +321,7 @@ class _Sight:
         """The mistake in the poses without which cameras see the points, in these colours where they have some."""
         found = [(self._moved(change), words) for words, change in mistakes]
         if not self.photographs:
-            fitting = (words for sight, words in found if seen < self._hardly and sight._in_view(self.points))
+            fitting = (words for sight, words in found if self._unseen(seen) and sight._in_view(self.points))
             return next(fitting, None)
         likeness, words = max((np.nan_to_num(sight.alike(self.points)), words) for sight, words in found)
         return words if likeness >= _SEEN else None
@@ -282,13 +332,12 @@ class _Sight:
         photographs = [(moved(camera), image) for camera, image in self.photographs]
         return replace(self, cameras=[moved(camera) for camera in self.cameras], photographs=photographs)
 
-    @property
-    def _hardly(self) -> float:
-        """Share of seen points below which something is wrong, whatever their colours."""
-        return _HARDLY if self.observed is None else _SEEN
+    def _unseen(self, seen: float) -> bool:
+        """Whether something is wrong, whatever the colours are, if cameras see this share of the points."""
+        return seen < (_HARDLY if self.observed is None else _SEEN) or self.drift(self.points) > _DRIFTED
 
     def _in_view(self, points: np.ndarray) -> bool:
-        return self.seen(points) > _WELL and self.away(points) < _FAR / 5
+        return self.seen(points) > _WELL and self.away(points) < _FAR / 5 and self.drift(points) <= _DRIFTED
 
 
 def _with_pose(camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Camera:

@@ -14,9 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError
+from shellgs_method.files import colmap
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
+from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import in_view
+from shellgs_method.geometry.lens import Lens
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
 from shellgs_method.registration.sfm_frame import _Sight, check_points, in_degrees, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
@@ -91,7 +94,7 @@ def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, wo
         check_points(find_sparse_points(layout), read_views(layout))
 
 
-@pytest.mark.parametrize("tracks", [True, False], ids=["tracks", "colours"])
+@pytest.mark.parametrize("tracks", ["keypoints", "tracks", "colours"])
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -102,9 +105,12 @@ def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, wo
     ids=["inverse", "OpenGL", "x y z w"],
 )
 def test_poses_of_another_convention_in_a_colmap_model_are_refused(points, views, change, words, tracks):
-    of_model = replace(
-        points, called="the SfM points of sparse/0", observed=observed(points, views) if tracks else None
-    )
+    known = tracked(points, views)
+    of_model = {
+        "keypoints": known,
+        "tracks": replace(known, features={}),
+        "colours": replace(known, features={}, observed=None),
+    }[tracks]
     wrong = [
         replace(v, camera=replace(v.camera, viewmat=torch.from_numpy(change(v.camera.viewmat.numpy())))) for v in views
     ]
@@ -114,9 +120,70 @@ def test_poses_of_another_convention_in_a_colmap_model_are_refused(points, views
 
 
 def test_points_of_a_model_with_tracks_in_another_unit_are_refused(points, views):
-    tracked = replace(other(points, np.diag([0.3048] * 3)), observed=observed(points, views))
+    known = tracked(points, views)
     with pytest.raises(SceneError, match="not in the frame of the cameras: perhaps they are in metres instead of feet"):
-        check_points(tracked, views)
+        check_points(other(known, np.diag([0.3048] * 3)), views)
+
+
+def tracked(points: SparsePoints, views: list[View], size: float = 1.0) -> SparsePoints:
+    """The points with their tracks, whose keypoints are of photographs of that size relative to the cameras'."""
+    shown = {view.name: in_view(view.camera, points.positions) for view in views}
+    sizes = {view.name: [view.camera.width, view.camera.height] for view in views}
+    return replace(
+        points,
+        called="the SfM points of sparse/0",
+        observed={name: np.flatnonzero(inside) for name, (inside, _, _) in shown.items()},
+        features={name: size * pixels / sizes[name] for name, (_, pixels, _) in shown.items()},
+    )
+
+
+def test_points_at_their_keypoints_are_accepted_in_silence(points, views, caplog):
+    lens = Lens(views[0].camera.K, views[0].camera.width, views[0].camera.height, (0.3, 0, 0, 0, 0, 0))
+    K = lens.K.double().numpy()
+    bent = tracked(points, views)
+    size = [lens.width, lens.height]
+    bent = replace(bent, features={k: distort_pixels(lens, f * size, K) / size for k, f in bent.features.items()})
+    for known, seen in (
+        (tracked(points, views), views),
+        (tracked(points, views), [replace(v, camera=v.camera.shrunk(20)) for v in views]),
+        (tracked(points, views, size=4.0), views),
+        (bent, [replace(view, lens=lens) for view in views]),
+    ):
+        check_points(known, seen)
+    assert not caplog.records
+    check_points(bent, views)
+    assert "not where the photographs show them, by their own tracks, but" in caplog.text
+
+
+@pytest.mark.parametrize("shown", ["poses in another order", "a focal length of another lens", "keypoints of a script"])
+def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, views, shown, caplog):
+    K = views[0].camera.K.numpy()
+    w, h, known = views[0].camera.width, views[0].camera.height, tracked(points, views)
+    assert known.observed is not None
+    images = {}
+    for number, view in enumerate(views):
+        posed = views[number - 1] if shown == "poses in another order" else view
+        viewmat, seen = posed.camera.viewmat.numpy(), known.observed[view.name]
+        x, y, z, scalar = Rotation.from_matrix(viewmat[:3, :3]).as_quat()
+        features = np.zeros(len(seen), colmap.KEYPOINT)
+        features["xy"], features["point"] = known.features[view.name] * [w, h], seen
+        if shown == "keypoints of a script":
+            features["xy"] = 0
+        images[number] = colmap.ColmapImage((scalar, x, y, z), tuple(viewmat[:3, 3]), 1, Path(view.name).name, features)
+    ids = np.arange(len(points.positions))
+    every = [known.observed[view.name] for view in views]
+    observers = [np.array([k for k, of in enumerate(every) if point in of], int) for point in ids]
+    keypoints = [np.array([np.searchsorted(every[k], point) for k in of], int) for point, of in enumerate(observers)]
+    f = 1.2 if shown == "a focal length of another lens" else 1.0
+    camera = colmap.ColmapCamera("PINHOLE", w, h, (f * K[0, 0], f * K[1, 1], K[0, 2], K[1, 2]))
+    assert points.colours is not None
+    cloud = colmap.Points(points.positions, points.colours, observers, keypoints, ids)
+    colmap.write_model(scene / "sparse" / "0", colmap.Model({1: camera}, images, cloud), np.zeros(len(ids)))
+    (scene / "transforms.json").unlink()
+    layout = FacadeDataParserConfig(data=scene)
+    check_points(find_sparse_points(layout), read_views(layout))
+    told = "sparse/0 are not where the photographs show them, by their own tracks" in caplog.text
+    assert told == (shown != "keypoints of a script")
 
 
 def written_scalar_last(viewmat: np.ndarray) -> np.ndarray:
@@ -125,11 +192,6 @@ def written_scalar_last(viewmat: np.ndarray) -> np.ndarray:
     wrong = viewmat.copy()
     wrong[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     return wrong
-
-
-def observed(points: SparsePoints, views: list[View]) -> dict[str, np.ndarray]:
-    """The points that each view sees, as its tracks."""
-    return {view.name: np.flatnonzero(in_view(view.camera, points.positions)[0]) for view in views}
 
 
 def test_points_without_colours_are_refused_if_no_camera_sees_them(points, views):
