@@ -190,7 +190,6 @@ class Session:
             }
         except SceneError as error:
             fit = {"problem": str(error)}
-        determined = {name for name, point in fitted.items() if np.isfinite(point.left_out_residual)}
         points = [
             {
                 "name": pick.name,
@@ -198,13 +197,14 @@ class Session:
                 "pixels": pick.pixels,
                 "left_out": pick.name in self.state.left_out,
                 "problem": problems.get(pick.name),
-                "errors": found[pick.name].errors if pick.name in found else {},
-                "residual": fitted[pick.name].residual if pick.name in fitted else None,
-                "without": fitted[pick.name].left_out_residual if pick.name in determined else None,
-                "used": pick.name in fitted and fitted[pick.name].is_used,
-                "sharp": pick.name not in found or found[pick.name].is_sharp,
+                "errors": seen.errors if seen else {},
+                "residual": known.residual if known else None,
+                "without": known.left_out_residual if known and np.isfinite(known.left_out_residual) else None,
+                "used": known is not None and known.is_used,
+                "sharp": seen is None or seen.is_sharp,
             }
             for pick in self.state.picks
+            for seen, known in [(found.get(pick.name), fitted.get(pick.name))]
         ]
         said = {"points": points, "active": self.state.active, "fit": fit, "predicted": {}, "lines": {}}
         return said | {"undo": len(self._earlier)} | self._guides(found, matrix)
