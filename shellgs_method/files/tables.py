@@ -86,22 +86,13 @@ class Table:
             text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
-        text = re.sub(r'^"?sep=."?$', "", text, count=1, flags=re.MULTILINE)  # Excel's hint to itself
-        tabbed = (
-            line for line in text.splitlines() if "\t" in line and _are_axes(_titles(line.lstrip("# ").split("\t")))
-        )
-        if not re.search("[,;]", next(tabbed, ",")):
-            text = text.replace("\t", ";")  # which shows empty cells
-        lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
-        numbered = (re.split(r"[\s,;]+", line) for _, line in lines if re.match(r"\s*#\w", line))
-        if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
-            notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")
+        lines = [(f"{path}, line {number}", line) for number, line in enumerate(_lines_of(text), start=1)]
+        comments = _comments_in([line for _, line in lines], path)
         worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
-        comments = [line.lstrip("# \t").rstrip() for _, line in lines if line.lstrip().startswith("#")]
         systems = [comment for comment in comments if names_system(comment)]
-        cells = [_titles(line.split()) for line in comments]
-        titles = [titles for titles in cells if worded and len(titles) == len(cells_of(worded[0][1]))]
-        titles = next((cells for cells in titles if _are_axes(cells, "XYZ")), [])
+        width = len(cells_of(worded[0][1])) if worded else 0
+        named = (cells for cells in (_titles(line.split()) for line in comments) if len(cells) == width)
+        titles = next((cells for cells in named if _are_axes(cells, "XYZ")), [])
         if worded and _is_header(worded[0][1]):
             words = worded.pop(0)[1]
             header = " ".join(words)
@@ -112,9 +103,8 @@ class Table:
             elif worded and _is_header(worded[0][1]) and _are_axes(below := _titles(worded[0][1])):
                 titles = below
                 worded.pop(0)
-        if not systems and (
-            meant := [line for line in comments if _SYSTEM.search(line) and not re.search(r"(\s[\d.]+){2}", line)]
-        ):
+        meant = [line for line in comments if _SYSTEM.search(line) and not re.search(r"(\s[\d.]+){2}", line)]
+        if meant and not systems:
             notice(f"{path}: the comment {meant[0]} names no system that PROJ knows: write it as # EPSG:25832 alone.")
         known = {crs: system for system in systems if (crs := known_crs(system))}
         if len(known) > 1:
@@ -264,6 +254,22 @@ class Table:
         places = self._position.values() or range(len(self.titles))
         names = {name for k in places for name in _called(self.titles[k])}
         return bool(names & {*LATITUDE} and names & {*LONGITUDE})
+
+
+def _lines_of(text: str) -> list[str]:
+    """The lines of a file, with semicolons in place of tabs where these separate columns, which shows empty cells."""
+    text = re.sub(r'^"?sep=."?$', "", text, count=1, flags=re.MULTILINE)  # Excel's hint to itself
+    tabbed = (line for line in text.splitlines() if "\t" in line)
+    header = next((line for line in tabbed if _are_axes(_titles(line.lstrip("# ").split("\t")))), ",")
+    return (text if re.search("[,;]", header) else text.replace("\t", ";")).splitlines()
+
+
+def _comments_in(lines: Sequence[str], path: Path) -> list[str]:
+    """What lines say that begin with #; that some look like rows is told."""
+    numbered = (re.split(r"[\s,;]+", line) for line in lines if re.match(r"\s*#\w", line))
+    if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
+        notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")
+    return [line.lstrip("# \t").rstrip() for line in lines if line.lstrip().startswith("#")]
 
 
 def names_system(text: str) -> bool:
