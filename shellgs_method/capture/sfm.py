@@ -396,7 +396,7 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
         and how it moved against it, in degrees and in steps from one shot to the next, the medians.
     """
     single = pycolmap.Reconstruction(model)
-    poses = {image.name: image.cam_from_world() for image in (single.image(i) for i in single.reg_image_ids())}
+    poses = {image.name: image.cam_from_world() for image in _registered(single)}
     first = [poses[name] for name in sorted(poses, key=along_the_walk) if name.startswith(prefixes[0])]
     path = np.array([pose.inverse().translation for pose in first]).reshape(-1, 3)
     step = np.median(np.linalg.norm(np.diff(path, axis=0), axis=1)) if len(path) > 1 else 0.0
@@ -525,9 +525,8 @@ def undistort(model: str, photographs: str, masks: str | None, output: str) -> N
     if masks is None:
         return
     reconstruction = pycolmap.Reconstruction(model)
-    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
-    stems = Counter(PurePath(image.name).with_suffix("") for image in images)
-    for image in images:
+    stems = Counter(PurePath(image.name).with_suffix("") for image in _registered(reconstruction))
+    for image in _registered(reconstruction):
         camera = reconstruction.camera(image.camera_id)
         mask = pycolmap.Bitmap.read(Path(masks) / f"{image.name}.png", as_rgb=False)
         if mask is None:

@@ -101,12 +101,12 @@ def _camera_path(file: TextIO) -> dict[str, Any]:
         check_camera_type(path["camera_type"])
         angled = path["camera_type"] != "equirectangular"
         for name in ("render_height", "render_width"):
-            _number_between(path, name, 0, np.inf, file.name)
+            _positive(path, name, np.inf, file.name)
         for camera in cameras:
             if not isinstance(camera, dict) or not _is_pose(camera.get("camera_to_world")):
                 raise SceneError(f"{file.name}: the camera_to_world of each camera must be 16 finite numbers")
             if angled:
-                _number_between(camera, "fov", 0, 180, file.name)
+                _positive(camera, "fov", 180, file.name)
         if path.get("crop") is not None:
             path["crop"] = _crop(path["crop"], file.name)
         if not path.get("seconds"):  # of a single keyframe, or of other programs
@@ -130,11 +130,11 @@ def _crop(crop: Any, where: str) -> dict[str, Any]:
     return {name: part.tolist() for name, part in parts.items()} | {"crop_bg_color": colour}
 
 
-def _number_between(numbers: dict[str, Any], name: str, low: float, high: float, where: str) -> None:
+def _positive(numbers: dict[str, Any], name: str, high: float, where: str) -> None:
     value = numbers.get(name)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < high:
         most = f" and below {high:g}" if np.isfinite(high) else ""
-        raise SceneError(f"{where}: its {name} must be a number above {low:g}{most}, and is {str(value)[:40]}")
+        raise SceneError(f"{where}: its {name} must be a number above 0{most}, and is {str(value)[:40]}")
 
 
 def _is_pose(matrix: object) -> bool:
