@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from shellgs_method.errors import SceneError
+from shellgs_method.evaluation.pixels import kept_pixels
 from shellgs_method.export.frame import Frame
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.splats import DEGREE_0, Splats
@@ -197,5 +198,4 @@ def psnr_of(run: TrainedRun, splats: Splats, frame: Frame) -> float:
 
 def _psnr(image: Float[Tensor, "H W 3"], batch: dict) -> float:
     error = (image - photograph_of(batch)).square()
-    kept = batch.get("mask", torch.ones_like(error[..., :1], dtype=torch.bool))
-    return float(-10 * weighted_mean(error, kept).log10())
+    return float(-10 * weighted_mean(error, kept_pixels(batch, image)).log10())
