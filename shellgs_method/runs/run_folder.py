@@ -223,14 +223,9 @@ def _candidates(path: Path, written: Path, folder: Path) -> Iterator[Path]:
         yield Path(os.path.normpath(folder / os.path.relpath(start / path, start / written)))
     yield path
     for above in (folder, *folder.parents):
-        candidate = above / _beside(path)
+        candidate = above / (path.name if path.is_absolute() else path)
         if not folder.is_relative_to(candidate):  # the folder of all runs of a scene has its name
             yield candidate
-
-
-def _beside(path: Path) -> Path:
-    """The part of a path that is looked for beside the run."""
-    return Path(path.name) if path.is_absolute() else path
 
 
 def _parsed(pipeline: Pipeline) -> DataparserOutputs | None:
