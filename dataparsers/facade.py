@@ -28,6 +28,7 @@ from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
 from shellgs_method.geometry.camera import OPENGL, Camera, positions
 from shellgs_method.geometry.precision import camera_step, warn_of_coarse
+from shellgs_method.geometry.similarity import transformed
 from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.registration.sfm_frame import check_points
 
@@ -110,7 +111,7 @@ class FacadeDataParser(DataParser):
             check_points(points, views)
         else:
             _tell_of_copies(recording, whole, config)
-        placed = scale * (points.positions @ transform[:3, :3].T + transform[:3, 3])
+        placed = scale * transformed(points.positions, transform)
         metres_per_unit = shell.metres_per_unit if shell else None
         to_world = np.eye(4)
         to_world[:3] = scale * transform[:3]

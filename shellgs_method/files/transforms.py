@@ -22,6 +22,7 @@ from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import OPENGL
 from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
+from shellgs_method.geometry.similarity import transformed
 
 NAME = "transforms.json"
 GREY = 128
@@ -136,7 +137,7 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
         raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
     undo = np.linalg.inv(_applied(read_json(scene / NAME), scene))
     colours = np.full(positions.shape, GREY, np.uint8) if colours is None else colours
-    return positions @ undo[:3, :3].T + undo[:3, 3], colours
+    return transformed(positions, undo), colours
 
 
 def _points_of(path: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:

@@ -16,6 +16,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.crs import metres_of_degrees
 from shellgs_method.files.readers.city import CityObject, Polygon, is_surface, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry, numbers_in
+from shellgs_method.geometry.similarity import transformed
 
 _OURS = re.compile(r"\{http://www\.opengis\.net/(citygml|gml)\b[^}]*\}")
 _HREF = "{http://www.w3.org/1999/xlink}href"
@@ -189,7 +190,7 @@ class _Model:
         point = self.linked(parts["referencePoint"])
         at = _positions(self._numbers(parts["referencePoint"] if point is None else point))[0]
         for rings in self._polygons(template, depth + 1):
-            yield [ring @ matrix[:3, :3].T + matrix[:3, 3] + at for ring in rings]
+            yield [transformed(ring, matrix) + at for ring in rings]
 
     def _rings(self, polygon: ET.Element) -> list[Float64[np.ndarray, "N 3"]]:
         """Outline and holes of a polygon; none where a side is curved, or without heights, as roads on a plan have."""

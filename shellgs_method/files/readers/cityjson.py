@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.files.readers.city import CityObject, Polygon, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.geometry.similarity import transformed
 
 _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 """Lists of lists around a geometry's surfaces."""
@@ -131,7 +132,7 @@ class _Document:
             return
         matrix = np.array(geometry["transformationMatrix"], np.float64).reshape(4, 4)
         (at,) = geometry["boundaries"]
-        moved = self.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + _at(self.vertices, [at])[0]
+        moved = transformed(self.template_vertices, matrix) + _at(self.vertices, [at])[0]
         yield from self._placed(self.templates[geometry["template"]], moved)
 
     def _placed(self, geometry: dict[str, Any], vertices: Float64[np.ndarray, "V 3"]) -> Iterator[Polygon]:

@@ -27,6 +27,7 @@ from shellgs_method.files.readers.contents import (
     splats,
     strip_triangles,
 )
+from shellgs_method.geometry.similarity import transformed
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -84,7 +85,7 @@ def read_gltf(path: Path) -> Geometry:
             raise ValueError(f"its instances have more than {_MOST} vertices")
         for matrix in matrices:
             mirrored = np.linalg.det(matrix[:3, :3]) < 0
-            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+            vertices.append(transformed(points, matrix))
             faces.append((triangles[:, ::-1] if mirrored else triangles) + count)
             count += len(points)
     return Geometry(np.concatenate(vertices), np.concatenate(faces))
