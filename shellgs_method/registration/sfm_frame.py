@@ -57,6 +57,9 @@ intensities in grey, 5 and more for those in colours and for classes."""
 _SEEN, _ALIKE = 0.5, 0.4
 _UNSEEN, _HARDLY, _WELL, _UNLIKE = 0.02, 0.1, 0.8, 0.15
 _SPECK = 1e-4  # of the extent of the cameras, which is nothing that could be trained on
+# Points' colours correlate with those of the photographs that observe them by .7 and more (at night .46), with those of
+# others by 0 to .5, or as much as with their own where the camera hardly moved.
+_OWN, _MORE = 0.6, 0.2
 _DRIFTED = 0.01  # of a photograph's sides: points of 450 models are within .003 of their keypoints in the median
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
 
@@ -180,6 +183,12 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
     seen, alike, away = sight.seen(sight.points), sight.alike(sight.points), sight.away(sight.points)
     drift = sight.drift(sight.points)
     if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE and drift <= _DRIFTED:
+        if _are_others(points, views):
+            notice(
+                f"{points.called} have other colours than the photographs that observe them, as if these were others "
+                "than those of the model: if they are in another order, turned, cropped or others of these names, put "
+                "back those that the cameras were found with."
+            )
         return
     apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
     remedy = "export cameras and points from one program, in one frame"
@@ -291,16 +300,11 @@ class _Sight:
 
     def alike(self, points: np.ndarray) -> float:
         """Correlation of the points' colours with those of the photographs, in each; NaN if too few are compared."""
-        own, shown = [np.empty((0, 3))], [np.empty((0, 3))]
+        compared = []
         for camera, image in self.photographs:
             inside, pixels, _ = in_view(camera, points)
-            if inside.sum() > 1:
-                columns, rows = pixels.astype(int).T
-                for found, colours in ((own, self.colours[inside]), (shown, image[rows, columns])):
-                    found.append(colours - colours.mean(axis=0))
-        one, other = np.concatenate(own), np.concatenate(shown)
-        norm = np.linalg.norm(one) * np.linalg.norm(other)
-        return float((one * other).sum() / norm) if len(one) >= _OBSERVATIONS and norm > 0 else float("nan")
+            compared.append((self.colours[inside], _at(pixels, image)))
+        return _correlation(compared)
 
     def away(self, points: np.ndarray) -> float:
         """Distance of the points' centre from the cameras', relative to the extent of these; 0 for a single one."""
@@ -338,6 +342,39 @@ class _Sight:
 
     def _in_view(self, points: np.ndarray) -> bool:
         return self.seen(points) > _WELL and self.away(points) < _FAR / 5 and self.drift(points) <= _DRIFTED
+
+
+def _are_others(points: SparsePoints, views: Sequence[View]) -> bool:
+    """Whether points have the colours of other photographs as much, or as little, as of those that observe them."""
+    if points.observed is None or points.colours is None:
+        return False
+    shown = [(view, *small) for view in (views[k] for k in spread(len(views), _PHOTOGRAPHS)) for small in _small(view)]
+    own, others = [], []
+    for view, camera, image in shown:
+        inside, pixels, _ = in_view(camera, points.positions[points.of(view)])
+        colours = points.colours[points.of(view)][inside]
+        if may_be_of(colours, [image]):
+            own.append((colours, _at(pixels, image)))
+            others += [
+                (colours, _at(pixels, other))
+                for *_, other in shown
+                if other is not image and other.shape == image.shape
+            ]
+    theirs = _correlation(own)
+    return theirs < _OWN and theirs < _correlation(others) + _MORE
+
+
+def _at(pixels: Float64[np.ndarray, "N 2"], image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "N 3"]:
+    columns, rows = pixels.astype(int).T
+    return image[rows, columns]
+
+
+def _correlation(compared: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Correlation of pairs of colours less the mean of each list of them; NaN if they are too few."""
+    centred = [[colours - colours.mean(axis=0) for colours in pair] for pair in compared if len(pair[0]) > 1]
+    one, other = (np.concatenate([np.empty((0, 3)), *(pair[k] for pair in centred)]) for k in (0, 1))
+    norm = np.linalg.norm(one) * np.linalg.norm(other)
+    return float((one * other).sum() / norm) if len(one) >= _OBSERVATIONS and norm > 0 else float("nan")
 
 
 def _with_pose(camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Camera:

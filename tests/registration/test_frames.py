@@ -142,7 +142,9 @@ def test_points_at_their_keypoints_are_accepted_in_silence(points, views, caplog
     K = lens.K.double().numpy()
     bent = tracked(points, views)
     size = [lens.width, lens.height]
-    bent = replace(bent, features={k: distort_pixels(lens, f * size, K) / size for k, f in bent.features.items()})
+    bent = replace(
+        bent, colours=None, features={k: distort_pixels(lens, f * size, K) / size for k, f in bent.features.items()}
+    )
     for known, seen in (
         (tracked(points, views), views),
         (tracked(points, views), [replace(v, camera=v.camera.shrunk(20)) for v in views]),
@@ -184,6 +186,17 @@ def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, view
     check_points(find_sparse_points(layout), read_views(layout))
     told = "sparse/0 are not where the photographs show them, by their own tracks" in caplog.text
     assert told == (shown != "keypoints of a script")
+
+
+def test_photographs_in_another_order_than_their_tracks_are_told(points, views, caplog):
+    known = tracked(points, views)
+    mixed = [replace(view, image=other.image) for view, other in zip(views, [*views[5:], *views[:5]], strict=True)]
+    check_points(replace(known, colours=255 - points.colours // 8), mixed)  # heights, say, tell nothing
+    same = [replace(views[0], name=view.name) for view in views]
+    check_points(tracked(points, same), same)
+    assert not caplog.records
+    check_points(known, mixed)
+    assert "the SfM points of sparse/0 have other colours than the photographs that observe them" in caplog.text
 
 
 def written_scalar_last(viewmat: np.ndarray) -> np.ndarray:
