@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from shellgs_method.errors import SceneError, decimal_comma, notice
 from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order, remedy_for
 from shellgs_method.files.paths import NamedFiles
-from shellgs_method.files.readers.contents import with_nan
+from shellgs_method.files.readers.contents import encoding_of, with_nan
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
 """Folders of numbered models, or of one; it may also be in the scene itself, as RealityScan exports it."""
@@ -176,7 +176,7 @@ def read_points(scene: Path, folder: Path, images_path: Path) -> Model:
     """
     files = NamedFiles(scene, images_path, scene / folder)
     images = {k: image._replace(name=_path(image.name, files)) for k, image in _images(scene / folder).items()}
-    there = any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt"))
+    there = _file(scene / folder, "points3D")
     points = _read(scene / folder, "points3D", _binary_points, _text_points) if there else _points([])
     return Model(_read(scene / folder, "cameras", _binary_cameras, _text_cameras), images, points)
 
@@ -240,7 +240,13 @@ def _numbered(scene: Path, place: Path) -> list[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+    return _file(folder, "cameras") is not None
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    """A file of a model, binary if there are both, its name in any letters, as points3d.txt; None if it is missing."""
+    there = {path.name.lower(): path for path in sorted(folder.glob("*"), reverse=True) if path.is_file()}
+    return there.get(f"{name.lower()}.bin", there.get(f"{name.lower()}.txt"))
 
 
 def _images(folder: Path) -> dict[int, ColmapImage]:
@@ -297,17 +303,17 @@ def _listed(files: NamedFiles) -> dict[str, set[str]]:
 
 
 def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable[[Iterator[str]], T]) -> T:
-    path = next((path for path in (folder / f"{name}.bin", folder / f"{name}.txt") if path.is_file()), None)
+    path = _file(folder, name)
     if path is None:
         raise FileNotFoundError(f"{folder} is not a COLMAP model: {name}.bin and {name}.txt are missing")
     try:
-        if path.suffix == ".bin":
+        if path.suffix.lower() == ".bin":
             file = _Bytes(path.read_bytes())
             read = binary(file)
             if file.at != len(file.data):
                 raise ValueError(f"it goes on for {len(file.data) - file.at} bytes after its last entry")
             return read
-        lines = map(str.strip, path.read_text("utf-8-sig", errors="surrogateescape").splitlines())
+        lines = map(str.strip, path.read_text(encoding_of(path), errors="surrogateescape").splitlines())
         return text(with_nan(line) for line in lines if line and not line.startswith("#"))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error

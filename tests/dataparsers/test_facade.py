@@ -790,6 +790,17 @@ def test_a_colmap_model_may_be_in_the_scene_folder_itself(scene):
     assert read_views(FacadeDataParserConfig(data=scene))[0].name == "frame_00001.png"
 
 
+def test_a_text_model_may_have_other_letters_in_its_names_and_windows_encoding(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    for name, other in (("cameras", "Cameras.TXT"), ("images", "images.txt"), ("points3D", "points3d.txt")):
+        path = scene / "sparse" / "0" / f"{name}.txt"
+        text = path.read_text()
+        path.unlink()
+        path.with_name(other).write_text(text, "utf-16")
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
+
+
 def test_whole_numbers_of_a_text_model_may_have_decimals(scene):
     write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
     for name, old, new in (("cameras", " 48 32 ", " 48.0 32.0 "), ("points3D", " 9 9 9 ", " 9.0 9.0 9.0 ")):
