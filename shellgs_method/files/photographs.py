@@ -18,7 +18,7 @@ from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
-from shellgs_method.files.profiles import hdr_of, in_srgb, primaries_of
+from shellgs_method.files.profiles import gamma_of, hdr_of, in_srgb, primaries_of, with_gamma
 from shellgs_method.files.transfer import WIDE, narrowed, tone_mapped
 from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
@@ -28,6 +28,8 @@ BLACK = 16
 """Brightest of 256 levels in a photograph that shows nothing: that of 12 bits stored as 16."""
 _SCALED = 0.1
 """Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
+_OTHERS = (".exr", ".hdr", ".jxl", ".jxr")
+"""Suffixes of formats that Pillow does not read."""
 _TURN_BACK = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -208,7 +210,7 @@ def read_image(path: Path) -> Image.Image:
         SceneError: the image cannot be read, or holds floating-point numbers or integers of more than 16 bits.
     """
     with opened(path) as image:
-        exif = exif_of(image)
+        exif, gamma = exif_of(image), gamma_of(image, path)
         if transfer := hdr_of(image, path):
             notice(
                 f"{path.parent} holds HDR photographs ({transfer}), which are tone-mapped: bright walls lose contrast; "
@@ -229,6 +231,7 @@ def read_image(path: Path) -> Image.Image:
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = in_srgb(image)
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        image = with_gamma(image, gamma) if gamma else image
     if np.max(image.getextrema()[:3]) <= BLACK:
         notice(
             f"{path.parent} holds photographs that are black, or nearly so: where a sensor's 12 bits or less are "
@@ -303,7 +306,7 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
 
     Raises:
         SceneError: the image cannot be read, is raw, has too many pixels, holds floating-point numbers, has bands of
-            16 bits that are not interleaved, or is a TIFF whose first page is a smaller one.
+            16 bits that are not interleaved or negative, or is a TIFF whose first page is a smaller one.
     """
     if path.suffix.lower() in RAW:
         raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
@@ -330,6 +333,11 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
                 "it in RGB of 8 or 16 bits, or put the whole file back"
             ) from error
         reason = " ".join(str(error).split())
+        if path.suffix.lower() in _OTHERS:
+            raise SceneError(
+                f"{path} is of a format of photographs that is not read: save it as JPEG, or as PNG or TIFF of 8 or "
+                "16 bits"
+            ) from error
         raise SceneError(
             f"{path} cannot be read as an image ({reason}): put the whole file back, or leave it out"
         ) from error
@@ -342,8 +350,8 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
             )
         if isinstance(image, TiffImageFile) and _is_misread(image):
             raise SceneError(
-                f"{path} stores its bands one after another with more than 8 bits, which is not read: save it with "
-                "interleaved bands, or 8 bits"
+                f"{path} stores its bands one after another with more than 8 bits, or white as 0, which is not read: "
+                "save it with interleaved bands and black as 0, or with 8 bits"
             )
         if whole and image.mode == "F":
             broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
@@ -372,10 +380,11 @@ def _largest_page(image: TiffImageFile) -> tuple[int, int]:
 
 
 def _is_misread(image: TiffImageFile) -> bool:
-    """Whether Pillow reads the bands of a TIFF as if they were interleaved, into noise."""
-    bits = image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (1,))
-    apart = image.tag_v2.get(TiffImagePlugin.PLANAR_CONFIGURATION, 1) == 2
-    return apart and len(bits) > 1 and max(bits) > 8
+    """Whether Pillow reads the bands of a TIFF as if they were interleaved, into noise, or as its negative."""
+    bits = np.ravel(image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (1,)))
+    apart = image.tag_v2.get(TiffImagePlugin.PLANAR_CONFIGURATION, 1) == 2 and len(bits) > 1
+    negative = image.tag_v2.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0
+    return bool((apart or negative) and max(bits) > 8)
 
 
 def _pixels(view: View) -> UInt8[np.ndarray, "H W C"]:

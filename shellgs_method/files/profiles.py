@@ -8,12 +8,14 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from PIL import ExifTags, Image, ImageCms
 
 from shellgs_method.files.exif import exif_of
-from shellgs_method.files.transfer import HDR, WIDE, Transfer
+from shellgs_method.files.transfer import HDR, WIDE, Transfer, srgb
 
 _ADOBE = "R03"  # interoperability index of a camera's file in Adobe RGB (DCF 2.0), which embeds no profile
+_SAME_GAMMA = 0.05  # of PNG's usual 1 / 2.2, to which programs round it
 _ALIKE = 2  # levels of 8 bits, to which profiles of sRGB differ
 _CODES = {  # where files that Pillow says nothing of have the codes of their primaries and their transfer function
     "AVIF": re.compile(rb"colrnclx(..)(..)", re.DOTALL),
@@ -53,7 +55,21 @@ def _codes_of(image: Image.Image, path: Path) -> tuple[int, int]:
 def is_srgb(image: Image.Image, path: Path) -> bool:
     """Whether the colours of an image are sRGB's, as far as it says; arguments are as of :func:`hdr_of`."""
     is_plain = hdr_of(image, path) is None and primaries_of(image, path) not in WIDE
-    return is_plain and _transform_of(image) is None
+    return is_plain and gamma_of(image, path) is None and _transform_of(image) is None
+
+
+def gamma_of(image: Image.Image, path: Path) -> float | None:
+    """Exponent to which colours of a PNG are stored, 1 for linear light; None where it is sRGB's, or not said."""
+    said = image.info.get("gamma") if image.format == "PNG" else None
+    if not said or {"icc_profile", "srgb"} & image.info.keys() or any(_codes_of(image, path)):
+        return None  # which count before it
+    return None if abs(2.2 * said - 1) < _SAME_GAMMA else said
+
+
+def with_gamma(image: Image.Image, gamma: float) -> Image.Image:
+    """An image of 8 bits, RGB or RGBA, whose colours are stored to this exponent, in sRGB."""
+    table = np.rint(255 * srgb(np.linspace(0, 1, 256) ** (1 / gamma))).astype(int).tolist()
+    return image.point(table * 3 + list(range(256)) * (len(image.getbands()) - 3))
 
 
 def in_srgb(image: Image.Image) -> Image.Image:

@@ -359,6 +359,25 @@ def test_a_tiff_that_begins_with_a_thumbnail_is_refused(tmp_path):
         read_image(tmp_path / "a.tif")
 
 
+def test_a_negative_of_16_bits_is_refused(tmp_path):
+    """Pillow turns those of 8 bits alone."""
+    pixels = np.full((12, 16), 60_000, np.uint16)
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, value in {256: 16, 257: 12, 258: 16, 259: 1, 262: 0, 277: 1, 278: 12, 273: 0, 279: pixels.nbytes}.items():
+        tags[tag] = value
+    with (tmp_path / "a.tif").open("wb") as file:
+        tags.save(file)
+        file.write(pixels.tobytes())
+    with pytest.raises(SceneError, match=r"a\.tif stores .* white as 0, which is not read"):
+        read_image(tmp_path / "a.tif")
+
+
+def test_a_photograph_of_a_format_that_is_not_read_is_named_as_such(tmp_path):
+    (tmp_path / "a.exr").write_bytes(b"\x76\x2f\x31\x01")
+    with pytest.raises(SceneError, match=r"a\.exr is of a format of photographs that is not read: save it as JPEG"):
+        read_image(tmp_path / "a.exr")
+
+
 def test_integers_of_more_than_16_bits_have_no_white(tmp_path):
     Image.fromarray(np.full((12, 16), 70_000, np.int32)).save(tmp_path / "a.tif")
     with pytest.raises(SceneError, match=r"a\.tif holds integers of more than 16 bits"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, PngImagePlugin
 
 from shellgs_method.capture.photographs import add_photograph
 from shellgs_method.files.photographs import read_image
@@ -48,6 +48,20 @@ def test_adobe_rgb_of_a_camera_is_known_by_its_exif_data(tmp_path, stored):
     np.testing.assert_allclose(colour(save(tmp_path / "a.jpg", stored, exif=exif)), ADOBE[stored], atol=3)
     preview = {"format": "MPO", "save_all": True, "append_images": [Image.new("RGB", (8, 8))]}
     np.testing.assert_allclose(colour(save(tmp_path / "b.jpg", stored, exif=exif, **preview)), ADOBE[stored], atol=3)
+
+
+@pytest.mark.parametrize(
+    ("gamma", "more", "shown"), [(1.0, {}, 188), (1.0, {"sRGB": b"\0"}, 128), (0.45455, {}, 128), (0.5, {}, 137)]
+)
+def test_a_png_of_another_gamma_is_converted(tmp_path, gamma, more, shown):
+    """As browsers do: 1 is linear light, as renderers write it; a chunk that says sRGB counts before it."""
+    chunks = PngImagePlugin.PngInfo()
+    for name, data in {"gAMA": round(1e5 * gamma).to_bytes(4, "big"), **more}.items():
+        chunks.add(name.encode(), data)
+    path = save(tmp_path / "a.png", (128, 0, 255), pnginfo=chunks)
+    np.testing.assert_allclose(colour(path), (shown, 0, 255), atol=1)
+    add_photograph(path, tmp_path / "scene" / "a.png")
+    np.testing.assert_allclose(colour(tmp_path / "scene" / "a.png"), (shown, 0, 255), atol=1)
 
 
 def test_a_captured_photograph_is_in_srgb(tmp_path):
