@@ -39,7 +39,7 @@ def rasterize(
         rows.append(torch.cat(row, dim=1))
     image = torch.cat(rows)
     composited, alpha, maps = image.tensor_split([features.shape[1], features.shape[1] + 1], dim=-1)
-    return composited, alpha, disc_maps(alpha, maps) if primitive == "2d" else {}
+    return composited, alpha, disc_maps(alpha, *maps.split(1, dim=-1)) if primitive == "2d" else {}
 
 
 def count_pairs(projection: Projection, primitive: Literal["3d", "2d"], width: int, height: int) -> int:
