@@ -22,7 +22,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.sim.collision.collider import Collider
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.formats.asset import FRICTION, write_parts
+from shellgs_method.sim.formats.asset import FRICTION
 from shellgs_method.sim.formats.mjcf import STIFF
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.front import Front
@@ -399,12 +399,6 @@ def test_a_glb_whose_triangles_alone_are_too_large_is_told(noisy, tmp_path, capl
     assert (tmp_path / "visual.glb").stat().st_size == facts["glb_bytes"] > 1e3
     assert f"has {facts['glb_bytes'] / 1e6:.3g} MB, more than 0.001" in caplog.text
     assert "give fewer --faces" in caplog.text
-
-
-def test_the_parts_of_an_earlier_collider_are_removed(collider, tmp_path):
-    write_parts(tmp_path, collider.parts)
-    write_parts(tmp_path, collider.parts[:2])
-    assert len(list((tmp_path / "collision").iterdir())) == 2
 
 
 def test_there_is_an_obj_for_each_class_of_surface(world, collider):

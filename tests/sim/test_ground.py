@@ -221,13 +221,6 @@ def test_the_mesh_of_the_other_formats_is_the_ground(ground, folder):
     assert ET.parse(folder / "world.sdf").getroot().findtext(".//collision[@name='ground']//uri") == MESH
 
 
-def test_files_of_a_ground_are_removed_with_it(ground, tmp_path):
-    write_world(tmp_path, [], frame_at(), ground)
-    write_world(tmp_path, [], frame_at())
-    assert not [*tmp_path.glob("ground.*")]
-    assert "hfield" not in (tmp_path / "world.xml").read_text()
-
-
 def test_level_ground_of_a_small_site_stays_as_it_is(ground):
     near = np.array([[EXTENT / 2 - AROUND, -20, 5], [0, 0, 90]])
     assert LEVEL.under(near) is LEVEL

@@ -51,10 +51,8 @@ def part_file(number: int) -> str:
 
 
 def write_parts(folder: Path, parts: Sequence[Part]) -> None:
-    """Write each convex part as an obj; those of an earlier run are removed."""
+    """Write each convex part as an obj."""
     (folder / "collision").mkdir(parents=True, exist_ok=True)
-    for stale in (folder / "collision").glob("part_*.obj"):
-        stale.unlink()
     for number, part in enumerate(parts):
         write_obj(folder / part_file(number), part.vertices, part.faces)
 

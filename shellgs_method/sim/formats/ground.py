@@ -18,12 +18,10 @@ FACES = 50_000
 
 
 def write_ground(out: Path, ground: Ground) -> Triangles | None:
-    """Write a ground's files, and return its mesh; of level ground there is none, and those of another are removed.
+    """Write a ground's files, and return its mesh; of level ground there is none.
 
     MuJoCo's own format of height fields is the numbers of rows and columns, and the heights, row by row.
     """
-    for stale in (FIELD, MESH):
-        (out / stale).unlink(missing_ok=True)
     if ground.is_level:
         return None
     surface = decimated(ground.surface, FACES)

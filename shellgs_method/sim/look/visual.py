@@ -34,7 +34,7 @@ def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " 
     """Write ``visual.glb`` (y-up, as glTF requires), and objs with ``visual.mtl`` and ``visual.png``.
 
     The texture of the glb alone is scaled down: simulators show ``visual.png``. There is an obj for each class of
-    surface: simulators segment images by object. Those of an earlier run are removed.
+    surface: simulators segment images by object.
 
     Args:
         folder: output folder.
@@ -55,8 +55,6 @@ def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " 
     with atomic_write(folder / TEXTURE) as file:
         mesh.image.save(file, "PNG")
     write_whole(folder / "visual.mtl", f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n")
-    for stale in folder.glob("visual*.obj"):
-        stale.unlink()
     for each in map(SurfaceClass, np.unique(classes)):
         write_whole(folder / visual_file(each), _obj(mesh, mesh.faces[classes == each]))
     sizes = {"texture": list(mesh.image.size), "glb_texture": list(small)}
