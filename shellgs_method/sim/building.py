@@ -153,10 +153,9 @@ class Reconstruction:
         """Cameras of the views in the simulation frame."""
         return [self.frame.camera(view.camera) for view in self.views]
 
-    @property
-    def photos(self) -> Sequence[Photo]:
+    def photos(self) -> Iterator[Photo]:
         """Photographs with cameras in the simulation frame and masks of the building, each loaded when asked for."""
-        return _Photos(self)
+        return map(self.photo, range(len(self.views)))
 
     def photo(self, index: int) -> Photo:
         """Load the photograph of a view, at the mean exposure."""
@@ -197,19 +196,6 @@ class Reconstruction:
                 "axes, its unit is unknown, so that simulators take it for the metre, and the collision geometry comes "
                 "from the reconstruction alone."
             )
-
-
-@dataclass(frozen=True, eq=False)
-class _Photos(Sequence[Photo]):
-    """The photographs of a reconstruction, none of which is kept in memory."""
-
-    made: Reconstruction
-
-    def __len__(self) -> int:
-        return len(self.made.views)
-
-    def __getitem__(self, index: int) -> Photo:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.made.photo(range(len(self))[index])  # an index beyond the end must raise, or iteration never ends
 
 
 def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray], below: list[np.ndarray]) -> Iterator[DepthView]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import tracemalloc
 import weakref
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -511,23 +510,20 @@ def places(count: int = 400, width: float = 1.2) -> np.ndarray:
 
 
 def test_the_texture_has_the_photographed_colours(wall):
-    textured = bake(wall, np.zeros((len(wall.vertices), 3)), [photo_of(frontal(x)) for x in (-0.8, 0.0, 0.8)])
+    textured = bake(wall, np.zeros((len(wall.vertices), 3)), lambda: [photo_of(frontal(x)) for x in (-0.8, 0.0, 0.8)])
     error = np.abs(texture_at(textured, places()) - pattern(places()))
     assert np.median(error) < 3
     assert np.quantile(error, 0.95) < 12
 
 
-class Loading(Sequence):
-    """Photographs that are loaded when asked for, and how many there were at most at the same time."""
+class Loading:
+    """Loads photographs, and knows how many there were at most at the same time."""
 
-    def __init__(self, cameras: Sequence[Camera]):
-        self.cameras, self.most, self.alive = cameras, 0, 0
+    def __init__(self):
+        self.most, self.alive = 0, 0
 
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index):
-        photo = photo_of(self.cameras[index])
+    def __call__(self, camera: Camera) -> Photo:
+        photo = photo_of(camera)
         weakref.finalize(photo.image, self._forget)
         self.alive += 1
         self.most = max(self.most, self.alive)
@@ -538,22 +534,22 @@ class Loading(Sequence):
 
 
 def test_a_texture_keeps_no_photographs_in_memory(wall):
-    photos = Loading([frontal(x) for x in np.linspace(-1, 1, 6)])
-    bake(wall, np.zeros((len(wall.vertices), 3)), photos)
-    assert photos.most <= 2  # one is loaded while the last one is still known
+    cameras, load = [frontal(x) for x in np.linspace(-1, 1, 6)], Loading()
+    bake(wall, np.zeros((len(wall.vertices), 3)), lambda: map(load, cameras))
+    assert load.most <= 2  # one is loaded while the last one is still known
 
 
 def test_a_texture_is_the_same_if_it_is_computed_in_parts(monkeypatch, wall):
     photos, colours = [photo_of(frontal(x)) for x in (-0.8, 0.8)], np.full((len(wall.vertices), 3), 99.0)
-    whole = bake(wall, colours, photos)
+    whole = bake(wall, colours, lambda: photos)
     monkeypatch.setattr(texture, "CHUNK", 500)
-    assert (np.asarray(bake(wall, colours, photos).image) == np.asarray(whole.image)).all()
+    assert (np.asarray(bake(wall, colours, lambda: photos).image) == np.asarray(whole.image)).all()
 
 
 def test_views_blend_into_each_other(wall):
     """Two views of different exposure: no step between neighbouring points is as large as that between the views."""
     photos = [photo_of(frontal(-1.2), 0.8), photo_of(frontal(1.2), 1.0)]
-    textured = bake(wall, np.zeros((len(wall.vertices), 3)), photos)
+    textured = bake(wall, np.zeros((len(wall.vertices), 3)), lambda: photos)
     line = np.stack([np.linspace(-0.9, 0.9, 200), np.zeros(200), np.ones(200)], axis=1)
     light = (texture_at(textured, line) / pattern(line)).mean(axis=1)
     assert light[:20].mean() < 0.85
@@ -573,10 +569,10 @@ def test_an_object_that_hides_the_wall_is_not_in_its_texture(wall):
     rays = camera.rays().numpy() @ pose[:3, :3].T
     hit = surface_of(post).cast(pose[:3, 3], rays).triangle >= 0
     black = photo._replace(image=np.where(hit[..., None], 0, photo.image).astype(np.uint8))
-    textured = bake(together, np.full((len(together.vertices), 3), 99.0), [black])
+    textured = bake(together, np.full((len(together.vertices), 3), 99.0), lambda: [black])
     behind = np.stack([np.zeros(20), np.zeros(20), np.linspace(0.2, 1.8, 20)], axis=1)
     assert np.abs(texture_at(textured, behind) - 99).max() < 3
-    masked = bake(wall, np.full((len(wall.vertices), 3), 99.0), [black._replace(mask=~hit)])
+    masked = bake(wall, np.full((len(wall.vertices), 3), 99.0), lambda: [black._replace(mask=~hit)])
     assert np.abs(texture_at(masked, behind) - 99).max() < 3
 
 

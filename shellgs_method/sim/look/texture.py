@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
-from scipy.sparse import coo_matrix, csc_array, hstack
+from scipy.sparse import csc_array, hstack
+from trimesh.geometry import mean_vertex_normals
 
 from shellgs_method.geometry.camera import Camera, project
 from shellgs_method.geometry.triangles import Triangles
@@ -59,7 +60,10 @@ class TexturedMesh:
 
 
 def bake(
-    surface: Triangles, colours: Float64[np.ndarray, "V 3"], photos: Sequence[Photo], texel: float | None = None
+    surface: Triangles,
+    colours: Float64[np.ndarray, "V 3"],
+    photos: Callable[[], Iterable[Photo]],
+    texel: float | None = None,
 ) -> TexturedMesh:
     """Unwrap a surface and texture it from photographs, or with its own colours where no photograph sees it.
 
@@ -69,11 +73,13 @@ def bake(
     Args:
         surface: mesh.
         colours: vertex colours in [0, 255].
-        photos: photographs with cameras in the mesh's frame; each is asked for twice, and not kept.
+        photos: gives photographs with cameras in the mesh's frame; it is called twice, and none of them is kept.
         texel: size of the texture's pixels, in metres; a little finer than the photographs' on the mesh if None.
     """
     # Sparse: a photograph of many sees a small part of the surface.
-    weights = csc_array(hstack([csc_array(_weights(surface, photo)[:, None]) for photo in photos]))
+    area_vectors = surface.areas[:, None] * surface.normals
+    normals = np.asarray(mean_vertex_normals(len(surface.vertices), surface.faces, area_vectors))
+    weights = csc_array(hstack([csc_array(_weights(surface, normals, photo)[:, None]) for photo in photos()]))
     best = weights.max(axis=1).toarray().ravel()
     if texel is None:  # a weight is pixels per square metre
         texel = float(FINER / np.sqrt(np.median(best[best > 0]))) if (best > 0).any() else 0.02
@@ -85,7 +91,7 @@ def bake(
     total, blend = np.full(len(texels.place), own, np.float32), np.empty((len(texels.place), 3), np.float32)
     for chunk in _chunks(len(blend)):
         blend[chunk] = own * texels.mean(colours, chunk)
-    for number, photo in enumerate(photos):
+    for number, photo in enumerate(photos()):
         sharp = (weights[:, [number]].toarray().ravel() / np.maximum(best, 1e-12)) ** SHARPNESS
         of_corners = sharp[corners]
         there = np.flatnonzero((of_corners > 0).any(axis=1)[texels.triangle])
@@ -110,7 +116,7 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK))
 
 
-def _weights(surface: Triangles, photo: Photo) -> Float64[np.ndarray, " V"]:
+def _weights(surface: Triangles, normals: Float64[np.ndarray, "V 3"], photo: Photo) -> Float64[np.ndarray, " V"]:
     """Pixels per square metre of the surface at each vertex in a photograph, 0 where it is not visible."""
     camera, vertices = photo.camera, surface.vertices
     pixels, depth = project(camera, vertices)
@@ -124,7 +130,7 @@ def _weights(surface: Triangles, photo: Photo) -> Float64[np.ndarray, " V"]:
         seen = seen[photo.mask[row, column]]
     away = eye - vertices[seen]
     distance = np.linalg.norm(away, axis=1)
-    cosine = np.abs(np.einsum("nc,nc->n", away, _vertex_normals(surface)[seen])) / distance
+    cosine = np.abs(np.einsum("nc,nc->n", away, normals[seen])) / distance
     weights = np.zeros(len(vertices))
     focal = float(camera.K[0, 0] * camera.K[1, 1])
     weights[seen] = cosine * focal / distance**2 * np.minimum(edge[seen], 1.0)
@@ -133,14 +139,6 @@ def _weights(surface: Triangles, photo: Photo) -> Float64[np.ndarray, " V"]:
     least = weights[surface.faces].min(axis=1)
     np.minimum.at(lowest, surface.faces.ravel(), np.repeat(least, 3))
     return np.where(np.isfinite(lowest), lowest, 0.0)
-
-
-def _vertex_normals(surface: Triangles) -> Float64[np.ndarray, "V 3"]:
-    count = len(surface.vertices)
-    rows, columns = surface.faces.ravel(), np.repeat(np.arange(len(surface.faces)), 3)
-    gather = coo_matrix((np.repeat(surface.areas, 3), (rows, columns)), shape=(count, len(surface.faces)))
-    normals = gather @ surface.normals
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def _sample(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
