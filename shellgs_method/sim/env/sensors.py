@@ -178,11 +178,5 @@ def splats_of(buildings: Sequence[Path]) -> Splats:
     """
     parts = [read_splats(path) for path in buildings]
     least = min(part.harmonics.shape[1] for part in parts)
-    return Splats(
-        torch.cat([part.means for part in parts]),
-        torch.cat([part.quats for part in parts]),
-        torch.cat([part.scales for part in parts]),
-        torch.cat([part.opacities for part in parts]),
-        torch.cat([part.harmonics[:, :least] for part in parts]),
-        discs=all(part.discs for part in parts),
-    )
+    tensors = [(each.means, each.quats, each.scales, each.opacities, each.harmonics[:, :least]) for each in parts]
+    return Splats(*map(torch.cat, zip(*tensors, strict=True)), discs=all(part.discs for part in parts))
