@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
 
@@ -363,50 +364,18 @@ def _set_paths_in_config(run: Job) -> None:
 
 
 class _Pieces(io.RawIOBase):
-    """A writable file that splits its content into pieces and collects what ``store`` returns for each."""
+    """A writable file that collects what ``store`` returns for each piece that is written."""
 
     def __init__(self, store: Callable[[Archive], Any]):
         self.stored: Pieces = []
-        self._store, self._piece = store, bytearray()
+        self._store = store
 
     def writable(self) -> bool:
         return True
 
     def write(self, data: Any) -> int:
-        self._piece += data
-        if len(self._piece) >= PIECE:
-            self._store_piece()
+        self.stored.append(self._store(np.frombuffer(bytes(data), np.uint8)))
         return len(data)
-
-    def close(self) -> None:
-        if self._piece:
-            self._store_piece()
-        super().close()
-
-    def _store_piece(self) -> None:
-        self.stored.append(self._store(np.frombuffer(bytes(self._piece), np.uint8)))
-        self._piece.clear()
-
-
-class _Joined(io.RawIOBase):
-    """A readable file over pieces, each fetched when it is read."""
-
-    def __init__(self, pieces: Iterator[Archive]):
-        self._pieces, self._rest = pieces, memoryview(b"")
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        while not self._rest:
-            piece = next(self._pieces, None)
-            if piece is None:
-                return 0
-            self._rest = memoryview(piece)  # pyright: ignore[reportArgumentType]
-        count = min(len(buffer), len(self._rest))
-        buffer[:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
 
 
 def _packed(folder: Path, store: Callable[[Archive], Any], spared: Set[PurePosixPath] = frozenset()) -> Pieces:
@@ -415,17 +384,20 @@ def _packed(folder: Path, store: Callable[[Archive], Any], spared: Set[PurePosix
     def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
         return None if PurePosixPath(member.name) in spared else member
 
-    with _Pieces(store) as file, tarfile.open(fileobj=file, mode="w|", dereference=True) as archive:  # pyright: ignore
+    pieces = _Pieces(store)
+    with io.BufferedWriter(pieces, PIECE) as file, tarfile.open(fileobj=file, mode="w|", dereference=True) as archive:
         archive.add(folder, arcname=".", filter=kept)
-    return file.stored
+    return pieces.stored
 
 
 def _unpack(pieces: Iterable[Archive], folder: Path) -> None:
-    """Unpack a folder, whole or not at all; an existing one is kept."""
+    """Unpack a folder, whole or not at all; an existing one is kept. A piece is fetched when it is read."""
+    records = (piece[k : k + tarfile.RECORDSIZE] for piece in pieces for k in range(0, len(piece), tarfile.RECORDSIZE))
+    stream: Any = SimpleNamespace(read=lambda _: bytes(next(records, b"")))  # as tarfile asks for its records
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as partial:
         unpacked = Path(partial) / folder.name
-        with tarfile.open(fileobj=io.BufferedReader(_Joined(iter(pieces))), mode="r|") as tar:
+        with tarfile.open(fileobj=stream, mode="r|") as tar:
             if hasattr(tarfile, "data_filter"):
                 tar.extractall(unpacked, filter="data")
             else:  # before Python 3.11.4 and 3.10.12: a cluster's archives are trusted then, as its code is
