@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from typing_extensions import Self
 
 from shellgs_method.losses.schedules import PAPER_ITERATIONS
 from shellgs_method.machine.constants import constant
-from shellgs_method.machine.elementwise import Value, elementwise
+from shellgs_method.machine.elementwise import Vector, elementwise
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 
 WIDE = 0.05
@@ -130,14 +129,8 @@ class GradientStrategy(DefaultStrategy):
 
 
 def _added(
-    gradient: Sequence[Value],
-    radius: Sequence[Value],
-    scale: Sequence[Value],
-    skipped: Sequence[Value],
-    grad2d: Sequence[Value],
-    count: Sequence[Value],
-    largest: Sequence[Value],
-) -> list[list[Value]]:
+    gradient: Vector, radius: Vector, scale: Vector, skipped: Vector, grad2d: Vector, count: Vector, largest: Vector
+) -> list[Vector]:
     """What is gathered of a Gaussian, with one more view; a step that was skipped adds no gradient."""
     x, y = gradient[0] * scale[0], gradient[1] * scale[1]
     shown = radius[0] > 0

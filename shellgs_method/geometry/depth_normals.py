@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,7 +9,7 @@ from torch.nn.functional import pad
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.crops import crops
-from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
+from shellgs_method.machine.elementwise import Vector, cross, dot, elementwise
 
 
 def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[Tensor, "H W 3"]:
@@ -34,13 +32,7 @@ def normals_along_rays(depth: Float[Tensor, "H W 1"], rays: Float[Tensor, "H W 3
     return pad(normal, (0, 0, 1, 1, 1, 1))
 
 
-def _normal(
-    centre: Sequence[Value],
-    right: Sequence[Value],
-    left: Sequence[Value],
-    top: Sequence[Value],
-    bottom: Sequence[Value],
-) -> list[list[Value]]:
+def _normal(centre: Vector, right: Vector, left: Vector, top: Vector, bottom: Vector) -> list[Vector]:
     a = [one - other for one, other in zip(right, left, strict=True)]
     b = [one - other for one, other in zip(top, bottom, strict=True)]
     normal = cross(a, b)

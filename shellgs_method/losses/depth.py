@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import unfold
 
 from shellgs_method.losses.windows import window_sums, windows
-from shellgs_method.machine.elementwise import Value, elementwise
+from shellgs_method.machine.elementwise import Vector, elementwise
 
 
 class NccLoss:
@@ -101,7 +100,7 @@ def _row_sums(
     return [*windows([x[:, inside], y[:, inside], *sums], size, dim=0)]
 
 
-def _of_row(xs: Sequence[Value], ys: Sequence[Value], valid: Sequence[Value]) -> list[list[Value]]:
+def _of_row(xs: Vector, ys: Vector, valid: Vector) -> list[Vector]:
     """Number of valid pixels of a row, and sums of x, y, x² and x y relative to its central value.
 
     E[x²] - E[x]² of nearly equal values loses all digits in float32. To keep the summands small, each row of a patch is
@@ -115,7 +114,7 @@ def _of_row(xs: Sequence[Value], ys: Sequence[Value], valid: Sequence[Value]) ->
     return [[functools.reduce(operator.add, each)] for each in zip(*terms, strict=True)]
 
 
-def _moments(*values: Sequence[Value]) -> list[list[Value]]:
+def _moments(*values: Vector) -> list[Vector]:
     """Means of x and y, variance of x, and covariance, over the valid pixels of a patch, from its rows' sums."""
     xs, ys, *sums, (per_pixel,) = values
     x0, y0 = xs[len(xs) // 2], ys[len(ys) // 2]
@@ -128,7 +127,7 @@ def _moments(*values: Sequence[Value]) -> list[list[Value]]:
     return [[x0 + x], [y0 + y], [xx - x * x], [xy - x * y]]
 
 
-def _correlate(*values: Sequence[Value]) -> list[list[Value]]:
+def _correlate(*values: Vector) -> list[Vector]:
     """Loss of a patch; and a, a E[y], b and b E[x] of it, the terms of the gradient.
 
     The gradient at a pixel is the sum of a (y - E[y]) + b (x - E[x]) over the patches that contain it. After the rows'
@@ -146,14 +145,8 @@ def _correlate(*values: Sequence[Value]) -> list[list[Value]]:
 
 
 def _gradient(
-    x: Sequence[Value],
-    y: Sequence[Value],
-    valid: Sequence[Value],
-    a: Sequence[Value],
-    a_mean_y: Sequence[Value],
-    b: Sequence[Value],
-    b_mean_x: Sequence[Value],
-) -> list[list[Value]]:
+    x: Vector, y: Vector, valid: Vector, a: Vector, a_mean_y: Vector, b: Vector, b_mean_x: Vector
+) -> list[Vector]:
     """Gradient at a pixel, from the window sums of the last four outputs of :func:`_correlate`."""
     return [[valid[0] * (y[0] * a[0] - a_mean_y[0] + x[0] * b[0] - b_mean_x[0])]]
 

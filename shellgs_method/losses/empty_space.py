@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.losses.normal import unit
 from shellgs_method.losses.reduction import mean_weights
-from shellgs_method.machine.elementwise import Value, elementwise
+from shellgs_method.machine.elementwise import Vector, elementwise
 
 BEHIND = 1.0
 """Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
@@ -56,13 +54,7 @@ class EmptySpaceLoss:
         return elementwise(_beyond, squares, alpha, self._slope, self._weights, self._tolerance)[0].sum()
 
 
-def _beyond(
-    square: Sequence[Value],
-    alpha: Sequence[Value],
-    slope: Sequence[Value],
-    weight: Sequence[Value],
-    tolerance: Sequence[Value],
-) -> list[list[Value]]:
+def _beyond(square: Vector, alpha: Vector, slope: Vector, weight: Vector, tolerance: Vector) -> list[Vector]:
     squared = slope[0] * slope[0] * square[0] + BEHIND**2 * torch.relu(1 - alpha[0])
     beyond = torch.relu(torch.sqrt(torch.clamp_min(squared, 1e-8)) - tolerance[0])
     return [[weight[0] * torch.log(1 + beyond / REACH) * REACH]]

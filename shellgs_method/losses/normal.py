@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from shellgs_method.losses.reduction import mean_weights
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Value, Vector, dot, elementwise
 
 SHORTEST = 1e-3
 """Length of the shortest normal that is normalized."""
@@ -44,11 +42,11 @@ class NormalLoss:
         return self._total - elementwise(_cosines, normal, self._target)[0].sum()
 
 
-def _cosines(normal: Sequence[Value], target: Sequence[Value]) -> list[list[Value]]:
+def _cosines(normal: Vector, target: Vector) -> list[Vector]:
     return [[dot(unit_vector(normal), target)]]
 
 
-def unit_vector(normal: Sequence[Value]) -> list[Value]:
+def unit_vector(normal: Vector) -> list[Value]:
     """:func:`unit` of one normal, by its coordinates."""
     length = torch.sqrt(torch.clamp_min(dot(normal, normal), SHORTEST**2))
     return [each / length for each in normal]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from shellgs_method.losses.reduction import weighted_mean
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Vector, dot, elementwise
 
 
 def normal_consistency_loss(
@@ -31,9 +29,7 @@ def normal_consistency_loss(
     return elementwise(_disagreement, normal, depth_normal, alpha.detach(), weights)[0].sum()
 
 
-def _disagreement(
-    normal: Sequence[Value], depth_normal: Sequence[Value], alpha: Sequence[Value], weight: Sequence[Value]
-) -> list[list[Value]]:
+def _disagreement(normal: Vector, depth_normal: Vector, alpha: Vector, weight: Vector) -> list[Vector]:
     return [[weight[0] * (1 - alpha[0] * dot(normal, depth_normal))]]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Bool, Float
 from kornia.filters import spatial_gradient
@@ -12,7 +10,7 @@ from torch.nn.functional import max_pool2d, pad
 
 from shellgs_method.losses.normal import unit_vector
 from shellgs_method.machine.crops import crops
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Vector, dot, elementwise
 
 
 class SmoothnessLoss:
@@ -38,9 +36,7 @@ class SmoothnessLoss:
         return elementwise(_roughness, *neighbours, self._weights)[0].sum()
 
 
-def _roughness(
-    normal: Sequence[Value], left: Sequence[Value], above: Sequence[Value], weight: Sequence[Value]
-) -> list[list[Value]]:
+def _roughness(normal: Vector, left: Vector, above: Vector, weight: Vector) -> list[Vector]:
     normal = unit_vector(normal)
     return [[weight[0] * (1 - (dot(normal, unit_vector(left)) + dot(normal, unit_vector(above))) / 2)]]
 

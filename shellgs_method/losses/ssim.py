@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from shellgs_method.losses.windows import window_sums
-from shellgs_method.machine.elementwise import Value, elementwise, in_loops
+from shellgs_method.machine.elementwise import Vector, elementwise, in_loops
 
 RADIUS = 5
 _GAUSSIAN = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-RADIUS, RADIUS + 1)]
@@ -82,13 +82,7 @@ class _Ssim(torch.autograd.Function):
         return grad_x + 2 * x * grad_xx + y * grad_xy, None, None, None
 
 
-def _similarity(
-    mean_x: Sequence[Value],
-    mean_xx: Sequence[Value],
-    mean_xy: Sequence[Value],
-    mean_y: Sequence[Value],
-    variance_y: Sequence[Value],
-) -> list[list[Value]]:
+def _similarity(mean_x: Vector, mean_xx: Vector, mean_xy: Vector, mean_y: Vector, variance_y: Vector) -> list[Vector]:
     """SSIM, and its derivatives w.r.t. the windows' means of x, x² and x y."""
     (x,), (xx,), (xy,), (y,), (yy,) = mean_x, mean_xx, mean_xy, mean_y, variance_y
     cross, squares = 2 * x * y + C1, x * x + y * y + C1

@@ -19,7 +19,9 @@ from shellgs_method.machine.symbols import CUDA_PRELUDE, PRELUDE, Symbol, gradie
 
 Value: TypeAlias = Any
 """A tensor, or a symbol."""
-Function: TypeAlias = Callable[..., Sequence[Sequence[Value]]]
+Vector: TypeAlias = Sequence[Value]
+"""Coordinates, or other values, of an element."""
+Function: TypeAlias = Callable[..., Sequence[Vector]]
 
 LANES = 16
 
@@ -46,7 +48,7 @@ def in_loops(*tensors: Tensor) -> bool:
     return cpp.compiles() if device.type == "cpu" else device.type == "cuda" and nvrtc.compiles(device.index)
 
 
-def dot(a: Sequence[Value], b: Sequence[Value | float]) -> Value:
+def dot(a: Vector, b: Sequence[Value | float]) -> Value:
     """Scalar product of two vectors, given by their coordinates."""
     return functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
 

@@ -6,7 +6,7 @@ is the same for both primitives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_along_rays
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Vector, dot, elementwise
 from shellgs_method.render.rasterizer.projection import rotate, rotated_axes, to_camera
 
 Primitive = Literal["3d", "2d"]
@@ -48,13 +48,7 @@ class DepthMoments(NamedTuple):
         return elementwise(_about, *self[1:], depth, alpha, self.origin[None])[0]
 
 
-def _about(
-    first: Sequence[Value],
-    second: Sequence[Value],
-    depth: Sequence[Value],
-    alpha: Sequence[Value],
-    origin: Sequence[Value],
-) -> list[list[Value]]:
+def _about(first: Vector, second: Vector, depth: Vector, alpha: Vector, origin: Vector) -> list[Vector]:
     d = depth[0] - origin[0]
     return [[second[0] - 2 * d * (first[0] - origin[0] * alpha[0]) + d * d * alpha[0]]]
 
@@ -159,9 +153,7 @@ def mode_of_depth(
     return torch.lerp(expected.double(), heavier, separate.where(total > 0, 0.0)).to(expected)
 
 
-def _normals_and_depths(
-    mean: Sequence[Value], quat: Sequence[Value], scale: Sequence[Value], viewmat: Sequence[Value]
-) -> list[list[Value]]:
+def _normals_and_depths(mean: Vector, quat: Vector, scale: Vector, viewmat: Vector) -> list[Vector]:
     """Normal, n·m, and depth of the centre."""
     centre = to_camera(mean, viewmat)
     axes = [rotate(axis, viewmat) for axis in rotated_axes(quat)]

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.machine.elementwise import Value, elementwise
+from shellgs_method.machine.elementwise import Value, Vector, elementwise
 
 TILE = 8  # pixels along the side of a tile
 
@@ -51,7 +51,7 @@ class Bins:
         return -(-self.width // TILE)
 
 
-def touches(ellipse: Sequence[Value], size: Sequence[Value]) -> Value:
+def touches(ellipse: Vector, size: Vector) -> Value:
     """Whether the bounding box of an ellipse touches an image of the given width and height."""
     (x, y, *_, reach_x, reach_y), (width, height) = ellipse, size
     return (x + reach_x > 0) & (y + reach_y > 0) & (x - reach_x < width) & (y - reach_y < height)
@@ -89,13 +89,13 @@ def stable_order(keys: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     return keys.sort(stable=True).indices
 
 
-def _rows(outlines: Sequence[Value], size: Sequence[Value]) -> list[Sequence[Value]]:
+def _rows(outlines: Vector, size: Vector) -> list[Vector]:
     """First row of tiles of a splat, and number of rows."""
     spans = [(v - reach, v + reach) for _, v, _, _, _, _, reach in _ellipses(outlines)]
     return [_tiles_between(*_around(spans), size[1])]
 
 
-def _columns(outlines: Sequence[Value], row: Sequence[Value], size: Sequence[Value]) -> list[Sequence[Value]]:
+def _columns(outlines: Vector, row: Vector, size: Vector) -> list[Vector]:
     """First tile of a splat in a row of tiles, and number of tiles.
 
     At height y above its centre, the ellipse A x² + 2 B x y + C y² = 1 spans
@@ -118,7 +118,7 @@ def _columns(outlines: Sequence[Value], row: Sequence[Value], size: Sequence[Val
     return [[tile_row * torch.floor((width + (TILE - 1)) / TILE) + first, n_tiles]]
 
 
-def _ellipses(outlines: Sequence[Value]) -> list[Sequence[Value]]:
+def _ellipses(outlines: Vector) -> list[Vector]:
     return [outlines[i : i + 7] for i in range(0, len(outlines), 7)]
 
 

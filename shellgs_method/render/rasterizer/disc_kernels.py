@@ -16,11 +16,10 @@ transmittance falls to 1/2 or less, with a gradient to that splat's depth alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 
-from shellgs_method.machine.elementwise import Value
+from shellgs_method.machine.elementwise import Value, Vector
 from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels
 from shellgs_method.render.rasterizer.projection import NEAR_PLANE
 
@@ -28,7 +27,7 @@ _LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, math.inf)
 
 
-def _evaluate(shape: Sequence[Value], x: Value, y: Value) -> Evaluated:
+def _evaluate(shape: Vector, x: Value, y: Value) -> Evaluated:
     """The rest are the low-pass minus the plane's exponent (``ahead``), s, t, and whether the ray hits, 1 or 0.
 
     The intersection decides where ``ahead`` is positive.
@@ -47,7 +46,7 @@ def _evaluate(shape: Sequence[Value], x: Value, y: Value) -> Evaluated:
 
 
 def _moments(
-    at: Evaluated, x: Value, y: Value, grad_z: Value, grad_maps: Sequence[Value], grad_depth: Value | None
+    at: Evaluated, x: Value, y: Value, grad_z: Value, grad_maps: Vector, grad_depth: Value | None
 ) -> list[Value]:
     """Sums and first moments of the gradients w.r.t. the numerators of s and t, and the inverse depth; of that w.r.t.
     the exponent where the low-pass decides; and the sum of that w.r.t. the exponent.
@@ -63,7 +62,7 @@ def _moments(
     return [each * by for each in (grad_s, grad_t, grad_i, grad_screen) for by in (1.0, x, y)] + [grad_z]
 
 
-def _gradients(shape: Sequence[Value], sums: Sequence[Value]) -> list[Value]:
+def _gradients(shape: Vector, sums: Vector) -> list[Value]:
     """Gradients by moments about the splat's centre, shifted there from the tile's."""
     u, v, a, b, c, d, _, q, r, _ = shape
     of_s, of_t, of_i, (_, nx, ny) = (

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
+from shellgs_method.machine.elementwise import Value, Vector, cross, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 from shellgs_method.render.rasterizer.projection import (
     NEAR_PLANE,
@@ -60,9 +60,7 @@ def project_discs(
     return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
 
 
-def _project_centres(
-    mean: Sequence[Value], viewmat: Sequence[Value], intrinsics: Sequence[Value]
-) -> list[Sequence[Value]]:
+def _project_centres(mean: Vector, viewmat: Vector, intrinsics: Vector) -> list[Vector]:
     """Means2d, depth, and whether the depth is beyond the near plane, 1 or 0; if not, it is set to 1."""
     fx, fy, cx, cy = intrinsics
     x, y, z = to_camera(mean, viewmat)
@@ -72,15 +70,15 @@ def _project_centres(
 
 
 def _project(
-    mean2d: Sequence[Value],
-    depth: Sequence[Value],
-    quat: Sequence[Value],
-    scale: Sequence[Value],
-    opacity: Sequence[Value],
-    viewmat: Sequence[Value],
-    intrinsics: Sequence[Value],
-    size: Sequence[Value],
-) -> list[Sequence[Value]]:
+    mean2d: Vector,
+    depth: Vector,
+    quat: Vector,
+    scale: Vector,
+    opacity: Vector,
+    viewmat: Vector,
+    intrinsics: Vector,
+    size: Vector,
+) -> list[Vector]:
     """Shape, two outlines, covariance, and whether the disc is visible, 1 or 0."""
     (z,), (opacity,), (fx, fy, cx, cy) = depth, opacity, intrinsics
     rays = [(mean2d[0] - cx) / fx, (mean2d[1] - cy) / fy, 1.0]
@@ -127,19 +125,13 @@ def disc_maps(
     return {"inverse_depth": inverse_depth, "median_depth": median_depth, "distortion": distortion}
 
 
-def _distortion(alpha: Sequence[Value], inverse_depth: Sequence[Value], square: Sequence[Value]) -> list[list[Value]]:
+def _distortion(alpha: Vector, inverse_depth: Vector, square: Vector) -> list[Vector]:
     mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
     return [[mapping**2 * (alpha[0] * square[0] - inverse_depth[0] * inverse_depth[0])]]
 
 
 def _outline(
-    x: Value,
-    y: Value,
-    z: Value,
-    half_axes: Sequence[Sequence[Value]],
-    radius: Value,
-    intrinsics: Sequence[Value],
-    size: Sequence[Value],
+    x: Value, y: Value, z: Value, half_axes: Sequence[Vector], radius: Value, intrinsics: Vector, size: Vector
 ) -> tuple[list[Value], list[Value]]:
     """Ellipse around a disc of a radius in half-axes, and the covariance of the disc as if seen from afar.
 

@@ -6,27 +6,26 @@ The shape of a Gaussian is a, b, c, n: at a pixel (dx, dy) from its centre, z = 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-from shellgs_method.machine.elementwise import Value
+from shellgs_method.machine.elementwise import Value, Vector
 from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels
 
 
-def _evaluate(shape: Sequence[Value], x: Value, y: Value) -> Evaluated:
+def _evaluate(shape: Vector, x: Value, y: Value) -> Evaluated:
     u, v, a, b, c, n = shape
     dx, dy = x - u, y - v
     return Evaluated((a * dx + b * dy) * dx + c * dy * dy + n)
 
 
 def _moments(
-    at: Evaluated, x: Value, y: Value, grad_z: Value, grad_maps: Sequence[Value], grad_depth: Value | None
+    at: Evaluated, x: Value, y: Value, grad_z: Value, grad_maps: Vector, grad_depth: Value | None
 ) -> list[Value]:
     del at, grad_maps, grad_depth
     qx, qy = grad_z * x, grad_z * y
     return [grad_z, qx, qy, qx * x, qx * y, qy * y]
 
 
-def _gradients(shape: Sequence[Value], sums: Sequence[Value]) -> list[Value]:
+def _gradients(shape: Vector, sums: Vector) -> list[Value]:
     """Gradients of u, v, a, b, c and n by moments about the splat's centre, shifted there from the tile's."""
     u, v, a, b, c, _ = shape
     q, sx, sy, sxx, sxy, syy = sums

@@ -31,7 +31,7 @@ from torch.nn.functional import embedding
 from shellgs_method.errors import notice
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.constants import constant
-from shellgs_method.machine.elementwise import Function, Value, dot, elementwise
+from shellgs_method.machine.elementwise import Function, Value, Vector, dot, elementwise
 from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
 from shellgs_method.render.rasterizer import discs as disc_projection
 from shellgs_method.render.rasterizer.binning import touches
@@ -168,13 +168,7 @@ def _floats(radii: Int[Tensor, "B N ..."]) -> Float[Tensor, "B N r"]:
     return (radii[..., None] if radii.dim() == 2 else radii).float()
 
 
-def _extent(
-    mean2d: Sequence[Value],
-    conic: Sequence[Value],
-    radii: Sequence[Value],
-    opacity: Sequence[Value],
-    size: Sequence[Value],
-) -> list[Sequence[Value]]:
+def _extent(mean2d: Vector, conic: Vector, radii: Vector, opacity: Vector, size: Vector) -> list[Vector]:
     """The inverse of a conic (a, b, c) is a multiple of (c, -b, a). Its determinant, lost to rounding for a long and
     thin splat, is not needed: gsplat's radii give the size. They are rounded up, and so is the result.
     """
@@ -191,17 +185,17 @@ def _extent(
     return [_tile_radii(reach, visible, radii), [three_sigma(covar2d, visible)]]
 
 
-def _kept(radii: Sequence[Value]) -> Value:
+def _kept(radii: Vector) -> Value:
     """Which splats gsplat has not culled."""
     return functools.reduce(operator.and_, [each > 0 for each in radii])
 
 
-def _touches(mean2d: Sequence[Value], reach: Sequence[Value], size: Sequence[Value]) -> Value:
+def _touches(mean2d: Vector, reach: Vector, size: Vector) -> Value:
     """Whether the box that reaches so far around a splat, if it is not too faint to have one, touches the image."""
     return (reach[0] > 0) & (reach[1] > 0) & touches([*mean2d, *reach], size)
 
 
-def _tile_radii(reach: Sequence[Value], visible: Value, radii: Sequence[Value]) -> list[Value]:
+def _tile_radii(reach: Vector, visible: Value, radii: Vector) -> list[Value]:
     """Radii to bin splats by: 0 for those not visible, whose reach may be undefined."""
     reach = [torch.maximum(*reach)] if len(radii) == 1 else [*reach]
     return [torch.where(visible, torch.ceil(each), 0.0) for each in reach]
@@ -266,7 +260,7 @@ class _Discs:
         return replace(self, means2d=means2d, ray_transforms=elementwise(_recentred, self.ray_transforms, means2d)[0])
 
 
-def _recentred(transform: Sequence[Value], mean2d: Sequence[Value]) -> list[list[Value]]:
+def _recentred(transform: Vector, mean2d: Vector) -> list[Vector]:
     t, depth = transform, transform[8]
     return [[t[0], t[1], mean2d[0] * depth, t[3], t[4], mean2d[1] * depth, t[6], t[7], depth]]
 
@@ -292,7 +286,7 @@ def _project_discs(
     return _Discs(means2d, ray_transforms, inverse_planes, sizes[..., 0].int(), tile_radii.view_as(radii))
 
 
-def _centres(transform: Sequence[Value], radii: Sequence[Value]) -> list[list[Value]]:
+def _centres(transform: Vector, radii: Vector) -> list[Vector]:
     """Projected centre, and the ray transform; that of a disc in front of the camera for one that gsplat culled.
 
     gsplat leaves the memory of culled discs uninitialised; none of it may reach a gradient, as 0 times NaN.
@@ -303,14 +297,8 @@ def _centres(transform: Sequence[Value], radii: Sequence[Value]) -> list[list[Va
 
 
 def _disc(
-    mean2d: Sequence[Value],
-    transform: Sequence[Value],
-    normal: Sequence[Value],
-    radii: Sequence[Value],
-    opacity: Sequence[Value],
-    K: Sequence[Value],
-    size: Sequence[Value],
-) -> list[Sequence[Value]]:
+    mean2d: Vector, transform: Vector, normal: Vector, radii: Vector, opacity: Vector, K: Vector, size: Vector
+) -> list[Vector]:
     """Ray transform, inverse plane, tile radii, and size of a disc, see :class:`_Discs`."""
     kept, cutoff, (fx, _, cx, _, fy, cy, *_) = _kept(radii), cutoffs(opacity[0]), K
     normal = [torch.where(kept, each, facing) for each, facing in zip(normal, (0.0, 0.0, -1.0), strict=True)]
@@ -340,14 +328,14 @@ def _disc(
     return [transform, inverse_plane, _tile_radii(reach, visible, radii), [three_sigma(covar2d, visible)]]
 
 
-def _reach(row: Sequence[Value], centre: Value, w: Sequence[Value], cutoff: Value, size: Sequence[Value]) -> Value:
+def _reach(row: Vector, centre: Value, w: Vector, cutoff: Value, size: Vector) -> Value:
     """Half a side of the box around a centre that contains a disc, and its low-pass, up to a cutoff.
 
     The points (u, v) of a disc with u² + v² = cutoff project to an ellipse, whose box follows from the dual conic
     T diag(cutoff, cutoff, -1) Tᵀ (2DGS, section 4.2), here in pixels relative to the projected centre.
     """
 
-    def product(a: Sequence[Value], b: Sequence[Value]) -> Value:
+    def product(a: Vector, b: Vector) -> Value:
         return cutoff * (a[0] * b[0] + a[1] * b[1]) - a[2] * b[2]
 
     row = [each - centre * other for each, other in zip(row, w, strict=True)]
@@ -439,9 +427,7 @@ def _padded(size: int) -> Function:
 def _with_products(size: int) -> Function:
     """The function that appends to features the products of a plane's coordinates, zeros, and the disc's index."""
 
-    def with_products(
-        features: Sequence[Value], inverse_plane: Sequence[Value], index: Sequence[Value]
-    ) -> list[list[Value]]:
+    def with_products(features: Vector, inverse_plane: Vector, index: Vector) -> list[Vector]:
         products = [inverse_plane[i] * inverse_plane[j] for i, j in _PAIRS]
         filling = [0 * index[0]] * (size - len(features) - len(products) - 1)
         return [[*features, *products, *filling, index[0]]]
@@ -455,7 +441,7 @@ def _maps(n_features: int) -> Function:
     over z².
     """
 
-    def maps(channels: Sequence[Value], inverse_plane: Sequence[Value], ray: Sequence[Value]) -> list[list[Value]]:
+    def maps(channels: Vector, inverse_plane: Vector, ray: Vector) -> list[Vector]:
         products = channels[n_features : n_features + len(_PAIRS)]
         pairs_of_ray = [(1 if i == j else 2) * ray[i] * ray[j] for i, j in _PAIRS]
         return [[*channels[:n_features]], [dot(inverse_plane, ray)], [dot(products, pairs_of_ray)]]
@@ -466,7 +452,7 @@ def _maps(n_features: int) -> Function:
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def _median(inverse_plane: Sequence[Value], ray: Sequence[Value], alpha: Sequence[Value]) -> list[list[Value]]:
+def _median(inverse_plane: Vector, ray: Vector, alpha: Vector) -> list[Vector]:
     """Depth at which a ray meets the plane of the median disc, 0 where there is none."""
     halves = alpha[0] >= 0.5
     return [[torch.where(halves, 1 / torch.where(halves, dot(inverse_plane, ray), 1.0), 0.0)]]

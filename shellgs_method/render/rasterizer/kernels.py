@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import torch
 
-from shellgs_method.machine.elementwise import Value
+from shellgs_method.machine.elementwise import Value, Vector
 from shellgs_method.machine.symbols import Symbol
 from shellgs_method.render.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
 
@@ -59,9 +59,9 @@ class Kernels:
 
     null_shape: tuple[float, ...]
     n_maps: int
-    evaluate: Callable[[Sequence[Value], Value, Value], Evaluated]
-    moments: Callable[[Evaluated, Value, Value, Value, Sequence[Value], Value | None], list[Value]]
-    gradients: Callable[[Sequence[Value], Sequence[Value]], list[Value]]
+    evaluate: Callable[[Vector, Value, Value], Evaluated]
+    moments: Callable[[Evaluated, Value, Value, Value, Vector, Value | None], list[Value]]
+    gradients: Callable[[Vector, Vector], list[Value]]
     n_moments: int
     n_probed: int
 
@@ -77,7 +77,7 @@ class Kernels:
 
 
 def composite_splat(
-    kernels: Kernels, splat: Sequence[Value], x: Value, y: Value, before: Value, stop: Value, totals: Sequence[Value]
+    kernels: Kernels, splat: Vector, x: Value, y: Value, before: Value, stop: Value, totals: Vector
 ) -> tuple[Value, list[Value]]:
     """Transmittance behind a splat, and the totals with it, given the transmittance before it."""
     at = kernels.evaluate(splat[: kernels.n_shape], x, y)
@@ -98,12 +98,7 @@ def attenuate(z: Value, transmittance: Value, stop: Value) -> tuple[Value, Value
 
 
 def step_back(
-    values: Sequence[Value],
-    z: Value,
-    before: Value,
-    alpha: Value,
-    behinds: Sequence[Value],
-    groups: Sequence[Sequence[Value]],
+    values: Vector, z: Value, before: Value, alpha: Value, behinds: Vector, groups: Sequence[Vector]
 ) -> tuple[list[Value], list[Value]]:
     """One splat of the backward pass: each group's ``behind`` before the splat, and its part of the gradient w.r.t. z.
 
@@ -124,14 +119,7 @@ def step_back(
 
 
 def contributions(
-    kernels: Kernels,
-    at: Evaluated,
-    x: Value,
-    y: Value,
-    before: Value,
-    alpha: Value,
-    grad_z: Sequence[Value],
-    gradients: Sequence[Value],
+    kernels: Kernels, at: Evaluated, x: Value, y: Value, before: Value, alpha: Value, grad_z: Vector, gradients: Vector
 ) -> list[Value]:
     """What a pixel adds to the sums of :func:`splat_gradients`, given all totals' gradients."""
     weight, n_features = alpha * before, len(gradients) - kernels.n_maps
@@ -144,7 +132,7 @@ def contributions(
     return sums if len(grad_z) == 1 else [*sums, *kernels.moments(at, x, y, grad_z[0], (), None)]
 
 
-def splat_gradients(kernels: Kernels, shape: Sequence[Value], sums: Sequence[Value], n_features: int) -> list[Value]:
+def splat_gradients(kernels: Kernels, shape: Vector, sums: Vector, n_features: int) -> list[Value]:
     """Gradients of a splat's parameters; with two groups of channels, those of the first n due to the first group too.
 
     Args:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
+from shellgs_method.machine.elementwise import Value, Vector, cross, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 
 NEAR_PLANE = 0.01
@@ -94,14 +94,8 @@ def project_gaussians(
 
 
 def _project(
-    mean: Sequence[Value],
-    quat: Sequence[Value],
-    scale: Sequence[Value],
-    opacity: Sequence[Value],
-    viewmat: Sequence[Value],
-    intrinsics: Sequence[Value],
-    size: Sequence[Value],
-) -> list[Sequence[Value]]:
+    mean: Vector, quat: Vector, scale: Vector, opacity: Vector, viewmat: Vector, intrinsics: Vector, size: Vector
+) -> list[Vector]:
     """The fields of :class:`Projection`, in this order; ``visible`` is 1 or 0."""
     (fx, fy, cx, cy), (width, height), (opacity,) = intrinsics, size, opacity
     x, y, z = to_camera(mean, viewmat)
@@ -142,7 +136,7 @@ def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"])
     return three_sigma(covars2d.unbind(-1), visible).int()
 
 
-def three_sigma(covar2d: Sequence[Value], visible: Value) -> Value:
+def three_sigma(covar2d: Vector, visible: Value) -> Value:
     """Radius of a splat, a whole number, see :func:`three_sigmas`."""
     xx, xy, yy = covar2d
     half = (xx - yy) / 2
@@ -163,12 +157,12 @@ def stack_cameras(
 # Vectors are lists of their coordinates, and matrices of their rows' values, one row after another.
 
 
-def to_camera(point: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
+def to_camera(point: Vector, viewmat: Vector) -> list[Value]:
     """Transform a point from the world to the camera frame."""
     return [each + viewmat[4 * i + 3] for i, each in enumerate(rotate(point, viewmat))]
 
 
-def rotate(vector: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
+def rotate(vector: Vector, viewmat: Vector) -> list[Value]:
     """Rotate a vector from the world to the camera frame."""
     return [dot(viewmat[4 * i : 4 * i + 3], vector) for i in range(3)]
 
@@ -190,7 +184,7 @@ def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     return torch.stack([torch.stack(axis, dim=-1) for axis in rotated_axes(quats.unbind(1))], dim=-1)
 
 
-def rotated_axes(quat: Sequence[Value]) -> list[list[Value]]:
+def rotated_axes(quat: Vector) -> list[list[Value]]:
     """Columns of the rotation matrix of a quaternion (w, x, y, z) of any norm."""
     w, x, y, z = quat
     double = 2 / torch.clamp_min(w * w + x * x + y * y + z * z, 1e-24)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Value, Vector, dot, elementwise
 
 
 def spherical_harmonics(
@@ -33,7 +32,7 @@ def spherical_harmonics(
     return elementwise(_sum, directions, counts, *(part.flatten(1) for part in coefficients))[0]
 
 
-def _sum(direction: Sequence[Value], counts: Sequence[Value], *coefficients: Sequence[Value]) -> list[list[Value]]:
+def _sum(direction: Vector, counts: Vector, *coefficients: Vector) -> list[Vector]:
     values = [value for part in coefficients for value in part]  # the channels of each term
     channels = len(values) // len(counts)
     x, y, z = direction
@@ -43,7 +42,7 @@ def _sum(direction: Sequence[Value], counts: Sequence[Value], *coefficients: Seq
     return [[dot(weights, values[channel::channels]) for channel in range(channels)]]
 
 
-def _harmonics(degree: int, direction: Sequence[Value]) -> list[Value]:
+def _harmonics(degree: int, direction: Vector) -> list[Value]:
     """Real harmonics of a unit direction, Condon-Shortley phase included.
 
     Recurrences from Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre functions
