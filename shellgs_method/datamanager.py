@@ -81,8 +81,13 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     config: FacadeDataManagerConfig
     train_pixel_sampler = NoPixelSampler()
-    _room_on_gpu: float | None = None
-    """Bytes of the GPU that photographs and maps may take besides those there already, once known."""
+
+    def __init__(self, *args, **kwargs):
+        self._readers = ThreadPoolExecutor(READERS)
+        self._ahead: dict[int, Future[dict]] = {}  # maps that are read before their turn
+        self._kept_on_gpu = set[int]()  # training views that are there with their maps
+        self._room_on_gpu: float | None = None  # bytes that these may take besides what is there, once known
+        super().__init__(*args, **kwargs)
 
     @cached_property
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:
@@ -306,15 +311,6 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             if index not in self._ahead and index not in self._kept_on_gpu:
                 self._ahead[index] = self._readers.submit(self.train_dataset.get_metadata, {"image_idx": index})
 
-    @cached_property
-    def _readers(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(READERS)
-
-    @cached_property
-    def _ahead(self) -> dict[int, Future[dict]]:
-        """Maps that are read before their turn."""
-        return {}
-
     def _on_gpu(self, batch: dict) -> dict:
         """A training view on the GPU, where it is kept from its first step on while there is room."""
         index = batch["image_idx"]
@@ -331,11 +327,6 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         elif self.train_dataset.held:  # the next copy need not wait
             self.cached_train[index] = {key: _pinned(value) for key, value in self.cached_train[index].items()}
         return view
-
-    @cached_property
-    def _kept_on_gpu(self) -> set[int]:
-        """Training views that are on the GPU with their maps."""
-        return set()
 
     def _share_of_gpu(self) -> float:
         """Bytes of the GPU that photographs and maps may take, which are told if they matter."""
