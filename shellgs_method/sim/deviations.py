@@ -105,9 +105,34 @@ def find_deviations(
     *cut, whole = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20, return_index=True)
     small, classes = Triangles(*cut), classes_of(shell.faces, classes)[whole]
     sources = sources_of(shell.faces, sources)[whole]
+    centres, best = small.centres, _best_views(shell, small, [camera for _, camera in views])
+    distance = np.where(best >= 0, along_normals(small, centres, fused), np.nan)
+    if contradicted is not None:
+        said = contradicted(centres)
+        distance = np.where(np.isfinite(said), said, distance)
+    flagged = np.abs(np.nan_to_num(distance)) > threshold
+    regions = []
+
+    def add(what: str, part: int, file: int, group: Int64[np.ndarray, " G"]) -> None:
+        shown = np.bincount(best[group][best[group] >= 0], minlength=len(views))
+        x, y, z = np.median(centres[group], axis=0).round(3).tolist()
+        photograph = views[int(shown.argmax())][0] if shown.any() else ""
+        area, away = (round(float(value), 3) for value in (small.areas[group].sum(), np.median(distance[group])))
+        regions.append(Region(what, area, away, (x, y, z), photograph, SurfaceClass(part).word, files[file]))
+
+    for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
+        for part, file in np.unique(np.stack([classes[chosen], sources[chosen]], axis=1), axis=0).tolist():
+            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part) & (sources == file))):
+                if small.areas[group].sum() >= least:
+                    add(what, part, file, group)
+    return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
+
+
+def _best_views(shell: Triangles, small: Triangles, cameras: Sequence[Camera]) -> Int64[np.ndarray, " F"]:
+    """Number of the view that shows each triangle of the subdivided shell best; -1 where none shows it."""
     centres = small.centres
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
-    for number, (_, camera) in enumerate(views):
+    for number, camera in enumerate(cameras):
         eye = camera.position.double().numpy()
         shown, _, depth = in_view(camera, centres)
         inside = np.flatnonzero(shown)[depth > 0.1]
@@ -118,41 +143,10 @@ def find_deviations(
         quality = np.where(visible, facing / length**2, 0.0)
         better = quality > score[inside]
         score[inside[better]], best[inside[better]] = quality[better], number
-    distance = np.where(best >= 0, along_normals(small, centres, fused), np.nan)
-    if contradicted is not None:
-        said = contradicted(centres)
-        distance = np.where(np.isfinite(said), said, distance)
-    flagged = np.abs(np.nan_to_num(distance)) > threshold
-    regions = []
-    names = [name for name, _ in views]
-    for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
-        for part, file in np.unique(np.stack([classes[chosen], sources[chosen]], axis=1), axis=0).tolist():
-            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part) & (sources == file))):
-                if (area := small.areas[group].sum()) >= least:
-                    kind, name = SurfaceClass(part), files[int(file)]
-                    regions.append(_region(what, kind, name, float(area), group, centres, distance, best, names))
-    return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
+    return best
 
 
 def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: Triangles) -> Float64[np.ndarray, " F"]:
     """Signed distance of another surface along each triangle's normal, seen from outside; NaN if none is in reach."""
     t = other.cast(places + REACH * small.normals, -small.normals).t
     return np.where(t < 2 * REACH, REACH - t, np.nan)
-
-
-def _region(
-    what: str,
-    part: SurfaceClass,
-    file: str,
-    area: float,
-    group: Int64[np.ndarray, " G"],
-    centres: np.ndarray,
-    distance: np.ndarray,
-    best: np.ndarray,
-    names: Sequence[str],
-) -> Region:
-    shown = np.bincount(best[group][best[group] >= 0], minlength=len(names))
-    x, y, z = np.median(centres[group], axis=0).round(3).tolist()
-    photograph = names[int(shown.argmax())] if shown.any() else ""
-    away = round(float(np.median(distance[group])), 3)
-    return Region(what, round(area, 3), away, (x, y, z), photograph, part.word, file)
