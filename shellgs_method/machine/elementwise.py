@@ -135,24 +135,7 @@ class _Loop(NamedTuple):
     """Numbers of coordinates of the outputs."""
 
 
-class _LoopOver(NamedTuple):
-    """A loop over inputs of given shapes."""
-
-    loop: _Loop
-    shape: tuple[int, ...]
-    rows: int
-    columns: int
-    strides: list[int]
-
-    def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        run, arguments, widths = self.loop
-        outputs = tuple([inputs[0].new_empty((*self.shape, width)) for width in widths])
-        at, to = [each.data_ptr() for each in inputs], [each.data_ptr() for each in outputs]
-        run(self.rows * self.columns, arguments(self.rows, self.columns, *at, *self.strides, *to))
-        return outputs
-
-
-def _loop_over(function: Function, inputs: Sequence[Tensor]) -> _LoopOver | None:
+def _loop_over(function: Function, inputs: Sequence[Tensor]) -> Callable[[Sequence[Tensor]], tuple[Tensor, ...]] | None:
     """The loop over inputs; None where it is not worth it, where they do not fit, or where it does not compile."""
     shapes, steps = [(1, 1, *each.shape)[-3:] for each in inputs], [(0, 0, *each.stride())[-3:] for each in inputs]
     dims, device = max([each.dim() for each in inputs]), inputs[0].device.index
@@ -167,7 +150,17 @@ def _loop_over(function: Function, inputs: Sequence[Tensor]) -> _LoopOver | None
         layouts.append((width, column if n_columns > 1 else 0, apart == 1 or width == 1))
         strides += (row if n_rows > 1 else 0, apart)
     loop = _loop(function, device, tuple(layouts))
-    return None if loop is None else _LoopOver(loop, (rows, columns)[3 - dims :], rows, columns, strides)
+    if loop is None:
+        return None
+    (run, arguments, widths), shape = loop, (rows, columns)[3 - dims :]
+
+    def over(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        outputs = tuple([inputs[0].new_empty((*shape, width)) for width in widths])
+        at, to = [each.data_ptr() for each in inputs], [each.data_ptr() for each in outputs]
+        run(rows * columns, arguments(rows, columns, *at, *strides, *to))
+        return outputs
+
+    return over
 
 
 @functools.cache
