@@ -13,6 +13,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.render.rasterizer.kernels import TRANSMITTANCE_MIN, Z_MAX
 from shellgs_method.render.rasterizer.projection import ALPHA_MAX, NEAR_PLANE, Projection, project_gaussians
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 TILE = 16
 PROJECT = {"3d": project_gaussians, "2d": project_discs}
@@ -28,7 +29,7 @@ def rasterize(
     primitive: Literal["3d", "2d"] = "3d",
 ) -> tuple[Float[Tensor, "height width C"], Float[Tensor, "height width 1"], dict[str, Tensor]]:
     """Same as :func:`shellgs_method.render.rasterizer.rasterize`, with only the maps in the info."""
-    projection = PROJECT[primitive](means, quats, scales, opacities, [camera])
+    projection = PROJECT[primitive](Ellipsoids(means, quats, scales, opacities), [camera])
     values = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
     rows = []
     for top in range(0, camera.height, TILE):

@@ -27,6 +27,7 @@ from benchmarks import naive
 from benchmarks.scenes import Scene, make_camera, make_scene
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.rasterizer import rasterize
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 BACKWARD_UP_TO = 960 * 540  # pixels; larger images are only rendered forward
 PROCESS = Path("/proc/self")  # Linux
@@ -186,7 +187,7 @@ def _resident(field: str) -> float:
 def pairs(case: Case) -> int:
     """(splat, pixel) pairs inside the footprints of a scene."""
     scene, camera = case.scene
-    projection = naive.PROJECT[case.primitive](*scene.splats(0)[:4], [camera])
+    projection = naive.PROJECT[case.primitive](Ellipsoids(*scene.splats(0)[:4]), [camera])
     return naive.count_pairs(projection, case.primitive, case.width, case.height)
 
 

@@ -36,7 +36,7 @@ def splat_maps(project: Callable, make: Callable, device: str) -> tuple[Callable
     camera = make_camera(61, 45).to(device, torch.float32)
 
     def projected(*splats: Tensor) -> list[Tensor]:
-        projection = project(*splats, [camera, camera])
+        projection = project(Ellipsoids(*splats), [camera, camera])
         bins = bin_splats(projection.outlines[0], 61, 45)
         return [projection.means2d, projection.shapes, bins.counts, projection.visible]
 
@@ -260,6 +260,7 @@ def test_a_call_on_cuda_is_one_launch(cuda):
 CALL = """
 import torch
 from shellgs_method.machine.elementwise import elementwise
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 def double(x):
     return [[2 * x[0]]]

@@ -23,20 +23,14 @@ from shellgs_method.render.rasterizer.projection import (
     stack_cameras,
     to_camera,
 )
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 LOW_PASS = 0.5  # variance in px² of the least that a disc is wide
 EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows; it is culled
 MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # depth range of the distortion, as in 2DGS
 
 
-def project_discs(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    cameras: Sequence[Camera],
-    with_probe: bool = False,
-) -> Projection:
+def project_discs(splats: Ellipsoids, cameras: Sequence[Camera], with_probe: bool = False) -> Projection:
     """Project discs with half-axes s_u t_u and s_v t_v, a splat's first two; means2d and shapes are differentiable.
 
     A ray z r (r_z = 1) meets the plane through m with normal n = t_u × t_v at depth z = n·m / n·r, where
@@ -47,7 +41,8 @@ def project_discs(
     The centres in the camera frame are computed from ``means2d`` and depths, so that the gradient w.r.t. ``means2d``
     is the full effect of moving the disc parallel to the screen: hence two kernels, with ``means2d`` between them.
     """
-    views, opacities = stack_cameras(cameras), opacities[:, None]
+    (means, quats, scales, opacities), views = splats, stack_cameras(cameras)
+    opacities = opacities[:, None]
     means2d, depths, in_front = elementwise(_project_centres, means, *views[:2])
     shapes, outlines, covars2d, visible = elementwise(_project, means2d, depths, quats, scales, opacities, *views)
     visible = (visible[..., 0] > 0) & (in_front[..., 0] > 0)

@@ -36,7 +36,7 @@ from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
 from shellgs_method.render.rasterizer import discs as disc_projection
 from shellgs_method.render.rasterizer.binning import touches
 from shellgs_method.render.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigma
-from shellgs_method.render.rasterizer.renders import Renders
+from shellgs_method.render.rasterizer.renders import Ellipsoids, Renders
 
 Backend = Literal["auto", "torch", "gsplat"]
 
@@ -66,20 +66,14 @@ def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
 
 
 def rasterize_3d(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    features: Float[Tensor, "N C"],
-    cameras: Sequence[Camera],
-    n_densifying: int | None = None,
+    splats: Ellipsoids, features: Float[Tensor, "N C"], cameras: Sequence[Camera], n_densifying: int | None
 ) -> Renders:
     """Rasterize Gaussians for cameras of one size; all tensors are float32 on a CUDA device.
 
     The render equals that of the torch backend, except that gsplat 1.4 culls splats beside the image that reach into it
     only beyond three standard deviations, where alpha is below 0.012.
     """
-    viewmats, Ks, width, height = _stack(cameras)
+    (means, quats, scales, opacities), (viewmats, Ks, width, height) = splats, _stack(cameras)
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
     )
@@ -96,13 +90,7 @@ def rasterize_3d(
 
 
 def rasterize_2d(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    features: Float[Tensor, "N C"],
-    cameras: Sequence[Camera],
-    n_densifying: int | None = None,
+    splats: Ellipsoids, features: Float[Tensor, "N C"], cameras: Sequence[Camera], n_densifying: int | None
 ) -> Renders:
     """Rasterize the discs of 2DGS (Huang et al. 2024).
 
@@ -113,7 +101,7 @@ def rasterize_2d(
     The render equals that of the torch backend, except that gsplat culls by its radii, and
     that all of a nearly edge-on disc has the depth of its centre in the maps.
     """
-    discs = _project_discs(means, quats, scales, opacities, cameras)
+    discs = _project_discs(splats, cameras)
     probe, groups = _probed(discs.means2d, features, n_densifying)
     views = []
     for i, camera in enumerate(cameras):
@@ -121,10 +109,8 @@ def rasterize_2d(
         disc = discs.of_view(i)
         bins = _bin(disc.means2d, disc.tile_radii, disc.depths, camera.width, camera.height)
         *others, (_, last) = groups
-        composited = [
-            _composite_discs(disc.moved(_of_view(to, i)), bins, opacities, each, camera) for to, each in others
-        ]
-        *rendered, alpha, maps = _composite_with_maps(disc, bins, opacities, last, camera)
+        composited = [_composite_discs(disc.moved(_of_view(to, i)), bins, each, camera) for to, each in others]
+        *rendered, alpha, maps = _composite_with_maps(disc, bins, last, camera)
         views.append((_joined([*composited, *rendered], dim=-1), alpha, *maps))
     composited, alpha, *maps = (_joined(each, dim=0) for each in zip(*views, strict=True))
     return Renders(composited, alpha, tuple(maps), probe, discs.radii)
@@ -238,6 +224,7 @@ class _Discs:
             a steep disc is treated as facing the camera.
         radii: see :class:`Renders`.
         tile_radii: half sides of the boxes, or squares, around the means2d outside of which alpha does not count.
+        opacities: the same for all cameras.
     """
 
     means2d: Float[Tensor, "B N 2"]
@@ -245,6 +232,7 @@ class _Discs:
     inverse_planes: Float[Tensor, "B N 3"]
     radii: Int[Tensor, "B N"]
     tile_radii: Float[Tensor, "B N ..."]
+    opacities: Float[Tensor, "1 N"]
 
     @property
     def depths(self) -> Float[Tensor, "B N"]:
@@ -265,16 +253,10 @@ def _recentred(transform: Vector, mean2d: Vector) -> list[Vector]:
     return [[t[0], t[1], mean2d[0] * depth, t[3], t[4], mean2d[1] * depth, t[6], t[7], depth]]
 
 
-def _project_discs(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    cameras: Sequence[Camera],
-) -> _Discs:
-    viewmats, Ks, width, height = _stack(cameras)
-    splats = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
-    radii, _, _, ray_transforms, normals = splats  # pyright: ignore[reportAssignmentType]
+def _project_discs(splats: Ellipsoids, cameras: Sequence[Camera]) -> _Discs:
+    (means, quats, scales, opacities), (viewmats, Ks, width, height) = splats, _stack(cameras)
+    found = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
+    radii, _, _, ray_transforms, normals = found  # pyright: ignore[reportAssignmentType]
     sides = _floats(radii)
     # The centres are computed from means2d, so that these get the full gradient of a shift on the screen. gsplat's own
     # are centres of boxes, unlike the torch backend's, and in 1.4 their gradient lacks the mixed terms of tilted discs.
@@ -283,7 +265,8 @@ def _project_discs(
     ray_transforms, inverse_planes, tile_radii, sizes = elementwise(
         _disc, *(means2d, ray_transforms, normals, sides, opacities[:, None], Ks.flatten(1)[:, None], size)
     )
-    return _Discs(means2d, ray_transforms, inverse_planes, sizes[..., 0].int(), tile_radii.view_as(radii))
+    radii, tile_radii = sizes[..., 0].int(), tile_radii.view_as(radii)
+    return _Discs(means2d, ray_transforms, inverse_planes, radii, tile_radii, opacities[None])
 
 
 def _centres(transform: Vector, radii: Vector) -> list[Vector]:
@@ -348,23 +331,15 @@ def _reach(row: Vector, centre: Value, w: Vector, cutoff: Value, size: Vector) -
 
 
 def _composite_discs(
-    discs: _Discs,
-    bins: tuple[Tensor, Tensor],
-    opacities: Float[Tensor, "N"],
-    features: Float[Tensor, "N C"],
-    camera: Camera,
+    discs: _Discs, bins: tuple[Tensor, Tensor], features: Float[Tensor, "N C"], camera: Camera
 ) -> Float[Tensor, "1 height width C"]:
     """Features of one camera."""
     (channels,) = elementwise(_padded(1 << features.shape[1].bit_length()), features)
-    return _run_discs(discs, bins, opacities, channels[None], camera)[0][..., : features.shape[1]]
+    return _run_discs(discs, bins, channels[None], camera)[0][..., : features.shape[1]]
 
 
 def _composite_with_maps(
-    discs: _Discs,
-    bins: tuple[Tensor, Tensor],
-    opacities: Float[Tensor, "N"],
-    features: Float[Tensor, "N C"],
-    camera: Camera,
+    discs: _Discs, bins: tuple[Tensor, Tensor], features: Float[Tensor, "N C"], camera: Camera
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     """Features, alpha, and the maps of one camera, see :class:`Renders`."""
     n_features = features.shape[1]
@@ -372,9 +347,7 @@ def _composite_with_maps(
     # as its depth: the disc's number here, to look it up.
     size = 1 << (n_features + 6).bit_length()
     (channels,) = elementwise(_with_products(size), features, discs.inverse_planes, _numbers(features))
-    composited, alpha, inverse_plane, median = (
-        each.squeeze(0) for each in _run_discs(discs, bins, opacities, channels, camera)
-    )
+    composited, alpha, inverse_plane, median = (each.squeeze(0) for each in _run_discs(discs, bins, channels, camera))
     rays = camera.rays()
     rendered, inverse_depth, square = elementwise(_maps(n_features), composited, inverse_plane, rays)
     (median_depth,) = elementwise(_median, embedding(_numbered(median[..., 0]), discs.inverse_planes[0]), rays, alpha)
@@ -397,16 +370,12 @@ def _numbered(medians: Float[Tensor, "height width"]) -> Int[Tensor, "height wid
 
 
 def _run_discs(
-    discs: _Discs,
-    bins: tuple[Tensor, Tensor],
-    opacities: Float[Tensor, "N"],
-    channels: Float[Tensor, "1 N c"],
-    camera: Camera,
+    discs: _Discs, bins: tuple[Tensor, Tensor], channels: Float[Tensor, "1 N c"], camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Composited channels, alpha and inverse planes, and the last channel of the median disc."""
     transforms = discs.ray_transforms.unflatten(-1, (3, 3))
     renders = rasterize_to_pixels_2dgs(
-        *(discs.means2d, transforms, channels, opacities[None], discs.inverse_planes),
+        *(discs.means2d, transforms, channels, discs.opacities, discs.inverse_planes),
         *(torch.zeros_like(discs.means2d), camera.width, camera.height, TILE, *bins),
     )
     composited, alpha, inverse_plane, _, median = renders  # pyright: ignore[reportAssignmentType]
@@ -417,7 +386,7 @@ def _run_discs(
 def _padded(size: int) -> Function:
     """The function that appends zeros to features."""
 
-    def padded(features: Sequence[Value]) -> list[list[Value]]:
+    def padded(features: Vector) -> list[Vector]:
         return [[*features, *[0 * features[0]] * (size - len(features))]]
 
     return padded

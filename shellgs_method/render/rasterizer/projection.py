@@ -14,6 +14,7 @@ from torch import Tensor
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.elementwise import Value, Vector, cross, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3  # variance in px² added to every splat
@@ -64,33 +65,18 @@ class View(NamedTuple):
     probed: Float[Tensor, "N 2+k"] | None
 
 
-def project_gaussians(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    cameras: Sequence[Camera],
-    with_probe: bool = False,
-) -> Projection:
+def project_gaussians(splats: Ellipsoids, cameras: Sequence[Camera], with_probe: bool = False) -> Projection:
     """Project Gaussians (EWA splatting, Zwicker et al. 2001); means2d and shapes are differentiable.
 
     The shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none depends on the
     screen position of the centre.
     """
     means2d, shapes, depths, outlines, covars2d, visible = elementwise(
-        _project, means, quats, scales, opacities[:, None], *stack_cameras(cameras)
+        _project, *splats[:3], splats.opacities[:, None], *stack_cameras(cameras)
     )
     probe = means2d.detach().requires_grad_() if with_probe else None
-    return Projection(
-        means2d,
-        shapes,
-        depths[..., 0],
-        outlines[..., None, :],
-        covars2d,
-        visible[..., 0] > 0,
-        probe=probe,
-        probed=probe,
-    )
+    outlines, visible = outlines[..., None, :], visible[..., 0] > 0
+    return Projection(means2d, shapes, depths[..., 0], outlines, covars2d, visible, probe=probe, probed=probe)
 
 
 def _project(

@@ -19,7 +19,7 @@ from shellgs_method.render.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.render.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.render.rasterizer.kernels import Kernels
 from shellgs_method.render.rasterizer.projection import Projection, View, project_gaussians, three_sigmas
-from shellgs_method.render.rasterizer.renders import Renders
+from shellgs_method.render.rasterizer.renders import Ellipsoids, Renders
 
 
 def rasterize(
@@ -79,7 +79,7 @@ def rasterize(
     cameras = [each.to(means) for each in cameras]
     on_gsplat = gsplat_backend.runs_on_gsplat(backend, means)
     render = (gsplat_backend.RASTERIZE if on_gsplat else _RASTERIZE)[primitive]
-    renders = render(means, quats, scales, opacities, features, cameras, n_densifying)
+    renders = render(Ellipsoids(means, quats, scales, opacities), features, cameras, n_densifying)
     info = {
         "means2d": renders.means2d,
         "radii": renders.radii,
@@ -98,16 +98,13 @@ def rasterize(
 def _rasterize(
     project: Callable[..., Projection],
     kernels: Kernels,
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
+    splats: Ellipsoids,
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
     n_densifying: int | None,
 ) -> Renders:
     """Rasterize in torch the primitive given by ``project`` and ``kernels``."""
-    projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
+    projection = project(splats, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
     composited, alpha, *maps = torch.stack(views).split([features.shape[1], 1, *[1] * kernels.n_maps], dim=-1)
     radii = three_sigmas(projection.covars2d, projection.visible)

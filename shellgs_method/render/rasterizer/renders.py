@@ -1,11 +1,21 @@
-"""Output of every rasterization backend."""
+"""Input and output of every rasterization backend."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+class Ellipsoids(NamedTuple):
+    """Splats without their features, as :func:`~.rasterization.rasterize` takes them; discs have no third axis."""
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, "N"]
 
 
 @dataclass(frozen=True)
