@@ -12,7 +12,7 @@ import contextlib
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -27,7 +27,6 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.scenes import Scene
-from dataparsers.cameras import pinhole_camera
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.model import FacadeModel
 from shellgs_method.render import view
@@ -188,9 +187,8 @@ def _model(trainer: FacadeTrainer) -> FacadeModel:
 
 
 def _cameras(trainer: FacadeTrainer) -> list[Camera]:
-    cameras = trainer.pipeline.datamanager.train_dataset.cameras  # pyright: ignore
-    views = [pinhole_camera(cameras[i : i + 1]) for i in range(len(cameras))]
-    return [replace(view, viewmat=view.viewmat.float()) for view in views]
+    dataset = trainer.pipeline.datamanager.train_dataset
+    return [dataset.camera(index).to(torch.float32) for index in range(len(dataset))]
 
 
 if __name__ == "__main__":
