@@ -18,6 +18,9 @@ BARELY = 0.001
 HARDLY = 0.5
 """Area in pixels below which, in every training view, a Gaussian is hardly shown."""
 
+Coverage = Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
+"""Area in pixels that each Gaussian covers of a camera's view, and whether it reaches into the view."""
+
 
 def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
     """Gaussians with a parameter that is not finite."""
@@ -28,32 +31,25 @@ def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
     return ~torch.stack(finite).all(dim=0)
 
 
-def contributions(
-    cameras: Iterable[Camera], coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
-) -> Float[Tensor, "N"]:
+def contributions(cameras: Iterable[Camera], coverage: Coverage) -> Float[Tensor, "N"]:
     """Largest area in pixels that each Gaussian covers of a training view, by the sum of compositing weights.
 
     As in RadSplat (Niemeyer et al. 2024), which takes the largest contribution to a pixel.
 
     Args:
         cameras: cameras of the training views, at least one.
-        coverage: area in pixels that each Gaussian covers of a view, and whether it reaches into the view.
+        coverage: what Gaussians cover of a view.
     """
     return reduce(torch.maximum, (coverage(camera)[0] for camera in cameras))
 
 
-def hardly_shown(
-    cameras: Iterable[Camera], coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
-) -> Bool[Tensor, "N"]:
+def hardly_shown(cameras: Iterable[Camera], coverage: Coverage) -> Bool[Tensor, "N"]:
     """Gaussians that contribute less than :data:`HARDLY` to every training view, see :func:`contributions`."""
     return contributions(cameras, coverage) < HARDLY
 
 
 def unshaped(
-    means: Float[Tensor, "N 3"],
-    scales: Float[Tensor, "N 3"],
-    cameras: Iterable[Camera],
-    coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]],
+    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], cameras: Iterable[Camera], coverage: Coverage
 ) -> Bool[Tensor, "N"]:
     """Gaussians that training views have not shaped, and that may spoil others.
 
@@ -64,7 +60,7 @@ def unshaped(
         means: centres in the cameras' world.
         scales: standard deviations along the axes, in the same units.
         cameras: cameras of the training views.
-        coverage: area in pixels that each Gaussian covers of a view, and whether it reaches into the view.
+        coverage: what Gaussians cover of a view.
     """
     total = squares = largest = means.new_zeros(len(means))  # of the shares of images that they cover
     shown, distance = total > 0, total + torch.inf
