@@ -61,7 +61,7 @@ class Front:
         return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
 
 
-def places_before(surface: Triangles, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
-    """Places where a robot could stand: along the facade, one to five metres in front of it."""
+def places_before(surface: Triangles, front: Front, count: int = 20) -> Float64[np.ndarray, "P 3"]:
+    """Places where a robot could stand: along the facade, one to five metres in front of it, 60 cm above the ground."""
     shares = np.linspace(0.02, 0.98, count)
-    return np.stack([front.before(surface, share, 1.0 + k % 5, height) for k, share in enumerate(shares)])
+    return np.stack([front.before(surface, share, 1.0 + k % 5, 0.6) for k, share in enumerate(shares)])

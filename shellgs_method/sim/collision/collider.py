@@ -34,6 +34,8 @@ COVERED = 0.001
 """Parts that protrude from the others by no more than this, in metres, are left out."""
 GROUND = 0.1
 """Height in metres above the ground up to which the fused surface is the ground's."""
+EYES = 24
+"""Number of cameras that tell what stands before the shell."""
 BACKED = 0.9
 """Share of the cameras that see something in front of the shell which must also see the shell behind it."""
 SPECK = 0.01
@@ -152,12 +154,7 @@ def depths(
 
 
 def standing_before(
-    shell: Triangles,
-    fused: Triangles,
-    eyes: Float64[np.ndarray, "E 3"],
-    least: float,
-    ground: Ground = LEVEL,
-    count: int = 24,
+    shell: Triangles, fused: Triangles, eyes: Float64[np.ndarray, "E 3"], least: float, ground: Ground = LEVEL
 ) -> Bool[np.ndarray, " F"]:
     """Mask of a surface's triangles that are visible, above the ground and over ``least`` metres in front of the shell.
 
@@ -170,13 +167,12 @@ def standing_before(
         eyes: camera positions.
         least: distance in metres up to which a reconstruction is noisy.
         ground: the ground.
-        count: number of cameras to test.
     """
     above = fused.centres[:, 2] > ground.at(fused.centres) + GROUND
     near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & above)
     places = fused.centres[near]
     seeing, backed = np.zeros(len(near)), np.zeros(len(near))
-    for eye in eyes[spread(len(eyes), count)]:
+    for eye in eyes[spread(len(eyes), EYES)]:
         visible = fused.sees(eye, places, 0.02)
         behind = shell.cast(eye, places - eye).triangle
         seeing += visible

@@ -24,13 +24,12 @@ LARGEST = 1280
 EDGE = (255, 0, 140)
 
 
-def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """Render a world off screen with MuJoCo's own renderer.
+def rendered(path: Path, cameras: Sequence[Camera]) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """Render the visual meshes of a world off screen with MuJoCo's own renderer.
 
     Args:
         path: model file.
         cameras: cameras in the model's frame.
-        group: group of the geoms to draw: 2 for visual meshes, 3 for collision geometry.
 
     Raises:
         SceneError: OpenGL is not available.
@@ -49,8 +48,7 @@ def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     option = mujoco.MjvOption()
-    option.geomgroup[:] = 0
-    option.geomgroup[group] = 1
+    option.geomgroup[:] = [group == 2 for group in range(6)]
     images = []
     for number, (camera, (width, height)) in enumerate(zip(cameras, sizes, strict=True)):
         try:
