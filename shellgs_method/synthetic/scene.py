@@ -91,7 +91,7 @@ class Facade(Site):
         layout = Layout(config.bays, config.storeys)
         tree, texture, hand = generators(config.seed, 3)
         around = {"street": street, "court": court}[config.surroundings]
-        mesh = merge([building(layout), around(layout, tree)])
+        mesh = merge([building(layout), *around(layout, tree)])
         daylight = Daylight(World(mesh), noise_lattice(texture))
         cameras = walk(layout.length, config.views, config.width, config.height, hand)
         return cls(daylight, cameras, np.ones((config.views, 3)), layout, mesh)

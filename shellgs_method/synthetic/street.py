@@ -17,24 +17,18 @@ CAR = 6.0
 """Spacing of parked cars, in metres."""
 
 
-def street(layout: Layout, rng: np.random.Generator) -> Mesh:
-    """Everything except the building, in the building's frame."""
-    return merge(_street(layout, rng))
-
-
-def court(layout: Layout, rng: np.random.Generator) -> Mesh:
+def court(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
     """A court so high and narrow that no photograph shows the sky: walls at both sides, behind and across."""
     left, right, height = -6.0, layout.length + 6.0, 40.0
-    walls = [
-        box((left - 4, -22, 0), (left, 14, height), Material.COURT),
-        box((right, -22, 0), (right + 4, 14, height), Material.COURT),
-        box((left, 9, 0), (right, 14, height), Material.COURT),
-        box((left, -22, 0), (right, -18, height), Material.COURT),
-    ]
-    return merge([*_pavement(layout, rng), *walls])
+    yield from _pavement(layout, rng)
+    yield box((left - 4, -22, 0), (left, 14, height), Material.COURT)
+    yield box((right, -22, 0), (right + 4, 14, height), Material.COURT)
+    yield box((left, 9, 0), (right, 14, height), Material.COURT)
+    yield box((left, -22, 0), (right, -18, height), Material.COURT)
 
 
-def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
+def street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
+    """Everything except the building, in the building's frame."""
     middle = layout.length / 2
     yield from _pavement(layout, rng)
     for y, heights in ((-24.0, (8.0, 15.0)), (30.0, (6.0, 11.0))):
