@@ -29,6 +29,7 @@ from shellgs_method.render.rasterizer import spherical_harmonics
 from shellgs_method.render.rasterizer.binning import bin_splats
 from shellgs_method.render.rasterizer.discs import project_discs
 from shellgs_method.render.rasterizer.projection import project_gaussians
+from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 
 def splat_maps(project: Callable, make: Callable, device: str) -> tuple[Callable, list[Tensor]]:
@@ -260,7 +261,6 @@ def test_a_call_on_cuda_is_one_launch(cuda):
 CALL = """
 import torch
 from shellgs_method.machine.elementwise import elementwise
-from shellgs_method.render.rasterizer.renders import Ellipsoids
 
 def double(x):
     return [[2 * x[0]]]

@@ -19,8 +19,9 @@ from torch.autograd.function import once_differentiable
 
 from shellgs_method.render.rasterizer.binning import TILE, Bins, stable_order
 from shellgs_method.render.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
-from shellgs_method.render.rasterizer.loops import Loops
+from shellgs_method.render.rasterizer.loops import Chunk, Loops
 from shellgs_method.render.rasterizer.plans import CHUNK, LANES, Plan, Strips
+from shellgs_method.render.rasterizer.projection import View
 
 # Tiles per batch, and chunks between checks of which tiles are still active. Small batches stay in a CPU's cache, large
 # ones need fewer kernel calls; a GPU is only busy with large ones, and each check makes the host wait for it.
@@ -33,29 +34,19 @@ MAX_STRIPS = 16  # strips of one tile
 
 
 def composite(
-    means2d: Float[Tensor, "N 2"],
-    shapes: Float[Tensor, "N S"],
-    features: Float[Tensor, "N C"],
-    order: Int[Tensor, "n"],
-    bins: Bins,
-    kernels: Kernels,
-    probed: Float[Tensor, "N 2+k"] | None = None,
-    n_densifying: int = 0,
+    view: View, features: Float[Tensor, "N C"], order: Int[Tensor, "n"], bins: Bins, kernels: Kernels, n_densifying: int
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
     Args:
-        means2d: centres in pixels.
-        shapes: shape parameters that the primitive's kernels take.
+        view: the splats; ``probed`` gets the gradient of the first ``n_densifying`` features alone.
         features: any channels.
         order: indices of the splats in the bins, front to back.
         bins: bins of the splats in this order.
         kernels: kernels of the primitive.
-        probed: a second copy of the means2d and the first k shape parameters, which gets the gradient of the first
-            ``n_densifying`` features alone; k depends on the primitive.
         n_densifying: number of these features.
     """
-    return _Composite.apply(means2d, shapes, features, probed, order, bins, kernels, n_densifying)
+    return _Composite.apply(view.means2d, view.shapes, features, view.probed, order, bins, kernels, n_densifying)
 
 
 @dataclass(frozen=True)
@@ -80,7 +71,7 @@ class _Composite(torch.autograd.Function):
         table = F.pad(torch.cat([*columns, features.new_ones(len(order), 1)], dim=1), (0, 0, 0, 1))
         table[-1, : kernels.n_shape] = table.new_tensor(kernels.null_shape)  # pads a tile's last chunk
         loops = Loops(kernels, features.shape[1] + 1, None if probed is None else n_densifying)
-        canvas, done = _composite_tiles(table, bins, loops)
+        canvas, done = _Tiles(table, bins, loops).composite()
         ctx.save_for_backward(table, order)
         ctx.n, ctx.bins, ctx.done, ctx.loops = len(means2d), bins, done, loops
         return _untile(canvas[:-1], bins)
@@ -89,7 +80,7 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, gradients):
         table, order = ctx.saved_tensors
-        grad_rows = _gradients(_tile(gradients, ctx.bins), table, ctx.done, ctx.loops)
+        grad_rows = _Tiles(table, ctx.bins, ctx.loops).gradients(_tile(gradients, ctx.bins), ctx.done)
         n_shape, n_params = ctx.loops.kernels.n_shape, table.shape[1]
         widths = [2, n_shape - 2, n_params - n_shape - 1, 1, grad_rows.shape[1] - n_params]
         means2d, shapes, features, _, probed = (
@@ -99,154 +90,146 @@ class _Composite(torch.autograd.Function):
         return means2d, shapes, features, None if ctx.loops.n_first is None else probed, None, None, None, None
 
 
-def _composite_tiles(
-    table: Float[Tensor, "N+1 K"], bins: Bins, loops: Loops
-) -> tuple[Float[Tensor, "tiles+1 C P"], list[_Composited]]:
-    """Totals of all tiles, and the plans that the backward pass retraces."""
-    canvas = table.new_zeros(len(bins.counts), loops.n_totals, TILE * TILE)
-    done = []
-    # Tiles with similar numbers of splats finish together.
-    busiest_first = bins.counts.argsort(descending=True)[: int((bins.counts > 0).sum())]
-    tiles_per_batch, chunks_per_look = CPU_BATCHES if table.device.type == "cpu" else GPU_BATCHES
-    for tiles in busiest_first.split(tiles_per_batch) if len(busiest_first) else ():
-        plan = Plan.of(Strips.whole(tiles, bins), bins, table)
-        left, transmittance = _composite_whole(plan, canvas, table, loops, chunks_per_look)
-        done.append(_Composited(plan))
-        if len(left):
-            strips = left.cut(min(MAX_STRIPS, max(1, tiles_per_batch // len(left))))
-            done.append(_composite_strips(strips, transmittance[strips.rows], canvas, table, bins, loops))
-    return canvas, done
+@dataclass(frozen=True)
+class _Tiles:
+    """What tiles are composited of.
 
-
-def _composite_whole(
-    plan: Plan,
-    canvas: Float[Tensor, "tiles+1 C P"],
-    table: Float[Tensor, "N+1 K"],
-    loops: Loops,
-    chunks_per_look: int,
-) -> tuple[Strips, Float[Tensor, "left P"]]:
-    """Composite whole tiles into ``canvas`` until few are active: what is left of these, and its transmittance."""
-    strips, sums = plan.strips, _zeros(plan, canvas)
-    counts = F.pad(strips.counts, (0, plan.n_lanes - len(strips))).view(-1, LANES)
-    ones = table.new_ones(len(strips), TILE * TILE)
-    for before, behind, brightest in _walk(plan, ones, sums, table, loops):
-        plan.transmittances.append(before)
-        n_done, n_chunks = len(plan.transmittances), len(plan.ends)
-        if n_done < n_chunks and n_done % chunks_per_look > 0:
-            continue
-        active = (brightest > 0) & (counts[: len(before)] > n_done * CHUNK)
-        n_active = int(active.sum())
-        few = n_active <= max(CUT_TILES, CUT_SHARE * active.numel())
-        if n_active == 0 or (few and n_chunks - n_done >= CUT_CHUNKS):
-            canvas[strips.tiles] = plan.by_strip(sums)
-            left = active.flatten().nonzero().squeeze(1)
-            return strips[left].after(n_done), behind.transpose(1, 2).flatten(0, 1)[left]
-    raise AssertionError("behind the last chunk, no tile is active")
-
-
-def _composite_strips(
-    strips: Strips,
-    transmittance: Float[Tensor, "n P"],
-    canvas: Float[Tensor, "tiles+1 C P"],
-    table: Float[Tensor, "N+1 K"],
-    bins: Bins,
-    loops: Loops,
-) -> _Composited:
-    """Composite the rest of tiles, cut into strips, into ``canvas``; ``transmittance`` is that before the rest."""
-    plan = Plan.of(strips, bins, table)
-    through = _transmittance_through(plan, _zeros(plan, canvas), table, loops)
-    before = transmittance * strips.product_before(through)
-    before, behind = (torch.where(each > TRANSMITTANCE_MIN, each, 0.0) for each in (before, before * through))
-    reached = before.amax(1) > 0
-    plan = Plan.of(strips[reached], bins, table)
-    sums = _zeros(plan, canvas)
-    for before_chunk, *_ in _walk(plan, before[reached], sums, table, loops):
-        plan.transmittances.append(before_chunk)
-    totals = plan.by_strip(sums)
-    canvas.index_add_(0, plan.strips.tiles, totals)
-    return _Composited(plan, totals, behind[reached])
-
-
-def _transmittance_through(
-    plan: Plan, unused: list[Float[Tensor, "G P V"]], table: Float[Tensor, "N+1 K"], loops: Loops
-) -> Float[Tensor, "n P"]:
-    """Transmittance through each strip alone, of pixels that never stop.
-
-    The loop that composites serves; what it composites, into ``unused``, is not needed.
+    Attributes:
+        table: parameters of all splats.
+        bins: splats of each tile.
+        loops: what composites a chunk of them.
     """
-    through = torch.empty_like(unused[0])
-    ones = table.new_ones(len(plan.strips), TILE * TILE)
-    for _, behind, _ in _walk(plan, ones, unused, table, loops, stop=-1.0):
-        through[: len(behind)] = behind
-    return plan.by_strip([through])[:, 0]
 
+    table: Float[Tensor, "N+1 K"]
+    bins: Bins
+    loops: Loops
 
-def _walk(
-    plan: Plan,
-    transmittance: Float[Tensor, "n P"],
-    sums: list[Float[Tensor, "G P V"]],
-    table: Float[Tensor, "N+1 K"],
-    loops: Loops,
-    stop: float = TRANSMITTANCE_MIN,
-) -> Iterator[tuple[Float[Tensor, "g P V"], Float[Tensor, "g P V"], Float[Tensor, "g V"]]]:
-    """Add a plan to ``sums`` chunk by chunk: transmittance before and behind a chunk, and the maximum of the latter."""
-    (behind,) = plan.side_by_side(transmittance[:, None])
-    for i in range(len(plan.ends)):
-        rows = plan.splats[plan.chunk(i)]
-        n = len(rows)
-        before = behind[:n]
-        behind, brightest = loops.forward(before, [each[:n] for each in sums], table, rows, plan.centres[:n], stop)
-        yield before, behind, brightest
+    def composite(self) -> tuple[Float[Tensor, "tiles+1 C P"], list[_Composited]]:
+        """Totals of all tiles, and the plans that the backward pass retraces."""
+        counts, table = self.bins.counts, self.table
+        canvas = table.new_zeros(len(counts), self.loops.n_totals, TILE * TILE)
+        done = []
+        # Tiles with similar numbers of splats finish together.
+        busiest_first = counts.argsort(descending=True)[: int((counts > 0).sum())]
+        tiles_per_batch, chunks_per_look = CPU_BATCHES if table.device.type == "cpu" else GPU_BATCHES
+        for tiles in busiest_first.split(tiles_per_batch) if len(busiest_first) else ():
+            plan = Plan.of(Strips.whole(tiles, self.bins), self.bins, table)
+            left, transmittance = self._whole(plan, canvas, chunks_per_look)
+            done.append(_Composited(plan))
+            if len(left):
+                strips = left.cut(min(MAX_STRIPS, max(1, tiles_per_batch // len(left))))
+                done.append(self._cut(strips, transmittance[strips.rows], canvas))
+        return canvas, done
 
+    def _whole(
+        self, plan: Plan, canvas: Float[Tensor, "tiles+1 C P"], chunks_per_look: int
+    ) -> tuple[Strips, Float[Tensor, "left P"]]:
+        """Composite whole tiles into ``canvas`` until few are active: what is left of these, and its transmittance."""
+        strips, sums = plan.strips, _zeros(plan, canvas)
+        counts = F.pad(strips.counts, (0, plan.n_lanes - len(strips))).view(-1, LANES)
+        ones = canvas.new_ones(len(strips), TILE * TILE)
+        for before, behind, brightest in self._walk(plan, ones, sums):
+            plan.transmittances.append(before)
+            n_done, n_chunks = len(plan.transmittances), len(plan.ends)
+            if n_done < n_chunks and n_done % chunks_per_look > 0:
+                continue
+            active = (brightest > 0) & (counts[: len(before)] > n_done * CHUNK)
+            n_active = int(active.sum())
+            few = n_active <= max(CUT_TILES, CUT_SHARE * active.numel())
+            if n_active == 0 or (few and n_chunks - n_done >= CUT_CHUNKS):
+                canvas[strips.tiles] = plan.by_strip(sums)
+                left = active.flatten().nonzero().squeeze(1)
+                return strips[left].after(n_done), behind.transpose(1, 2).flatten(0, 1)[left]
+        raise AssertionError("behind the last chunk, no tile is active")
 
-def _gradients(
-    gradients: Float[Tensor, "tiles+1 C P"],
-    table: Float[Tensor, "N+1 K"],
-    done: list[_Composited],
-    loops: Loops,
-) -> Float[Tensor, "N+1 K+probed"]:
-    """Gradients of the table's rows from those of the composited totals, followed by those of the probed parameters."""
-    grad_table = table.new_zeros(len(table), loops.n_columns)
-    behind = table.new_zeros(len(gradients), loops.n_groups, TILE * TILE)
-    for group in _in_groups(done[::-1], MAX_SUMMED // (CHUNK * LANES * grad_table[0].nbytes)):
-        splats = torch.cat([each.plan.splats[: each.plan.n_composited] for each in group])
-        grad_rows = table.new_empty(*splats.shape, loops.n_columns)
-        parts = grad_rows.split([each.plan.n_composited for each in group])
-        for each, part in zip(group, parts, strict=True):
-            _backward_plan(each, part, gradients, behind, table, loops)
-        grad_table += _sum_by_splat(grad_rows.flatten(0, 2), splats.flatten(), len(table))
-    return grad_table
+    def _cut(
+        self, strips: Strips, transmittance: Float[Tensor, "n P"], canvas: Float[Tensor, "tiles+1 C P"]
+    ) -> _Composited:
+        """Composite the rest of tiles, cut into strips, into ``canvas``; ``transmittance`` is that before the rest."""
+        plan = Plan.of(strips, self.bins, self.table)
+        through = self._through(plan, _zeros(plan, canvas))
+        before = transmittance * strips.product_before(through)
+        before, behind = (torch.where(each > TRANSMITTANCE_MIN, each, 0.0) for each in (before, before * through))
+        reached = before.amax(1) > 0
+        plan = Plan.of(strips[reached], self.bins, self.table)
+        sums = _zeros(plan, canvas)
+        for before_chunk, *_ in self._walk(plan, before[reached], sums):
+            plan.transmittances.append(before_chunk)
+        totals = plan.by_strip(sums)
+        canvas.index_add_(0, plan.strips.tiles, totals)
+        return _Composited(plan, totals, behind[reached])
 
+    def _through(self, plan: Plan, unused: list[Float[Tensor, "G P V"]]) -> Float[Tensor, "n P"]:
+        """Transmittance through each strip alone, of pixels that never stop.
 
-def _backward_plan(
-    done: _Composited,
-    grad_rows: Float[Tensor, "rows L V K"],
-    gradients: Float[Tensor, "tiles+1 C P"],
-    behind: Float[Tensor, "tiles+1 groups P"],
-    table: Float[Tensor, "N+1 K"],
-    loops: Loops,
-) -> None:
-    """Fill in the gradients of a plan's splats, and update ``behind`` to the state before them."""
-    plan, strips = done.plan, done.plan.strips
-    of_strips = gradients[strips.tiles]
-    behind_strips = behind[strips.tiles] if done.totals is None else _behind_strips(done, of_strips, loops)
-    gradients_here, behind_here = plan.side_by_side(of_strips), plan.side_by_side(behind_strips)
-    for i, before in reversed([*enumerate(plan.transmittances)]):
-        rows, n = plan.chunk(i), len(before)
-        behinds, totals = ([each[:n] for each in lanes] for lanes in (behind_here, gradients_here))
-        loops.backward(before, behinds, totals, grad_rows[rows], table, plan.splats[rows], plan.centres[:n])
-    first = strips.ranks == 0
-    behind[strips.tiles[first]] = plan.by_strip(behind_here)[first]
+        The loop that composites serves; what it composites, into ``unused``, is not needed.
+        """
+        through = torch.empty_like(unused[0])
+        ones = through.new_ones(len(plan.strips), TILE * TILE)
+        for _, behind, _ in self._walk(plan, ones, unused, stop=-1.0):
+            through[: len(behind)] = behind
+        return plan.by_strip([through])[:, 0]
 
+    def _walk(
+        self,
+        plan: Plan,
+        transmittance: Float[Tensor, "n P"],
+        sums: list[Float[Tensor, "G P V"]],
+        stop: float = TRANSMITTANCE_MIN,
+    ) -> Iterator[tuple[Float[Tensor, "g P V"], Float[Tensor, "g P V"], Float[Tensor, "g V"]]]:
+        """Add a plan to ``sums`` chunk by chunk: transmittance before and behind a chunk, and the latter's maximum."""
+        (behind,) = plan.side_by_side(transmittance[:, None])
+        for i in range(len(plan.ends)):
+            rows = plan.splats[plan.chunk(i)]
+            n = len(rows)
+            chunk = Chunk(behind[:n], self.table, rows, plan.centres[:n])
+            behind, brightest = self.loops.forward(chunk, [each[:n] for each in sums], stop)
+            yield chunk.before, behind, brightest
 
-def _behind_strips(done: _Composited, gradients: Float[Tensor, "n C P"], loops: Loops) -> Float[Tensor, "n groups P"]:
-    """``behind`` (see :func:`~.kernels.step_back`) at the end of each strip."""
-    assert done.totals is not None
-    assert done.behind is not None
-    received = (gradients * done.totals).unbind(1)
-    received = torch.stack([torch.stack(list(group)).sum(0) for group in loops.groups(received)], dim=1)
-    transmittance = done.behind[:, None]
-    return torch.where(transmittance > 0, done.plan.strips.sum_behind(received) / transmittance, 0.0)
+    def gradients(
+        self, gradients: Float[Tensor, "tiles+1 C P"], done: list[_Composited]
+    ) -> Float[Tensor, "N+1 K+probed"]:
+        """Gradients of the table's rows from those of the totals, followed by those of the probed parameters."""
+        n_columns = self.loops.n_columns
+        grad_table = self.table.new_zeros(len(self.table), n_columns)
+        behind = self.table.new_zeros(len(gradients), self.loops.n_groups, TILE * TILE)
+        for group in _in_groups(done[::-1], MAX_SUMMED // (CHUNK * LANES * grad_table[0].nbytes)):
+            splats = torch.cat([each.plan.splats[: each.plan.n_composited] for each in group])
+            grad_rows = self.table.new_empty(*splats.shape, n_columns)
+            parts = grad_rows.split([each.plan.n_composited for each in group])
+            for each, part in zip(group, parts, strict=True):
+                self._retrace(each, part, gradients, behind)
+            grad_table += _sum_by_splat(grad_rows.flatten(0, 2), splats.flatten(), len(self.table))
+        return grad_table
+
+    def _retrace(
+        self,
+        done: _Composited,
+        grad_rows: Float[Tensor, "rows L V K"],
+        gradients: Float[Tensor, "tiles+1 C P"],
+        behind: Float[Tensor, "tiles+1 groups P"],
+    ) -> None:
+        """Fill in the gradients of a plan's splats, and update ``behind`` to the state before them."""
+        plan, strips = done.plan, done.plan.strips
+        of_strips = gradients[strips.tiles]
+        behind_strips = behind[strips.tiles] if done.totals is None else self._behind(done, of_strips)
+        gradients_here, behind_here = plan.side_by_side(of_strips), plan.side_by_side(behind_strips)
+        for i, before in reversed([*enumerate(plan.transmittances)]):
+            rows, n = plan.chunk(i), len(before)
+            behinds, totals = ([each[:n] for each in lanes] for lanes in (behind_here, gradients_here))
+            chunk = Chunk(before, self.table, plan.splats[rows], plan.centres[:n])
+            self.loops.backward(chunk, behinds, totals, grad_rows[rows])
+        first = strips.ranks == 0
+        behind[strips.tiles[first]] = plan.by_strip(behind_here)[first]
+
+    def _behind(self, done: _Composited, gradients: Float[Tensor, "n C P"]) -> Float[Tensor, "n groups P"]:
+        """``behind`` (see :func:`~.kernels.step_back`) at the end of each strip."""
+        assert done.totals is not None
+        assert done.behind is not None
+        received = (gradients * done.totals).unbind(1)
+        received = torch.stack([torch.stack(list(group)).sum(0) for group in self.loops.groups(received)], dim=1)
+        transmittance = done.behind[:, None]
+        return torch.where(transmittance > 0, done.plan.strips.sum_behind(received) / transmittance, 0.0)
 
 
 def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, "n"], n_splats: int) -> Float[Tensor, "n_splats K"]:

@@ -1,9 +1,4 @@
-"""Kernels over a chunk of splats of many tiles: in C++ on a CPU with a compiler, else in torch, with the same results.
-
-A chunk's arguments: the transmittance before it (0 once the pixel has stopped) [G P V]; a list of totals, or of their
-gradients [G P V]; the table of all splats; the table rows of the chunk's splats [G L V]; and the tiles' centres
-[G 2 V]. See :mod:`~.kernels` for the letters.
-"""
+"""Kernels over a chunk of splats of many tiles: C++ on a CPU with a compiler, else torch, with the same results."""
 
 from __future__ import annotations
 
@@ -12,6 +7,7 @@ import functools
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32
@@ -31,6 +27,25 @@ from shellgs_method.render.rasterizer.kernels import (
     step_back,
 )
 from shellgs_method.render.rasterizer.plans import CHUNK, LANES
+
+
+class Chunk(NamedTuple):
+    """Some splats of many tiles; see :mod:`~.kernels` for the letters."""
+
+    before: Float[Tensor, "G P V"]
+    """Transmittance before them, 0 once the pixel has stopped."""
+    table: Float[Tensor, "N K"]
+    """Parameters of all splats."""
+    splats: Int32[Tensor, "G L V"]
+    """Rows of the table."""
+    centres: Float[Tensor, "G 2 V"]
+    """Centres of the tiles."""
+
+    def parameters(self) -> list[list[Float[Tensor, "G 1 V"]]]:
+        """Parameters of each splat, with u and v relative to the tiles' centres."""
+        u, v, *rest = self.table[self.splats].unbind(-1)  # [G L V] each
+        params = torch.stack([u - self.centres[:, :1], v - self.centres[:, 1:], *rest])
+        return [list(splat.unbind(0)) for splat in params[:, :, :, None].unbind(2)]
 
 
 @dataclass(frozen=True)
@@ -68,25 +83,17 @@ class Loops:
         return [weighted] if self.n_first is None else [weighted[: self.n_first], weighted[self.n_first :]]
 
     def forward(
-        self,
-        before: Float[Tensor, "G P V"],
-        totals: list[Float[Tensor, "G P V"]],
-        table: Float[Tensor, "N K"],
-        splats: Int32[Tensor, "G L V"],
-        centres: Float[Tensor, "G 2 V"],
-        stop: float = TRANSMITTANCE_MIN,
+        self, chunk: Chunk, totals: list[Float[Tensor, "G P V"]], stop: float = TRANSMITTANCE_MIN
     ) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G V"]]:
         """Add a chunk to the totals; return the transmittance behind it, and its maximum over each tile's pixels."""
-        if compiled := _compiled(self, table):
+        before = chunk.before
+        if compiled := _compiled(self, chunk.table):
             behind, brightest = torch.empty_like(before), before.new_empty(len(before), LANES)
-            outputs = [behind, brightest, *totals]
-            compiled.forward(
-                _threads(before), len(before), ctypes.c_float(stop), *_at(before, table, splats, centres, *outputs)
-            )
+            arguments = _at(*chunk, behind, brightest, *totals)
+            compiled.forward(_threads(before), len(before), ctypes.c_float(stop), *arguments)
             return behind, brightest
-        params, (x, y) = _look_up(table, splats, centres), _pixels(table)
-        transmittance, sums = before, totals
-        for splat in params:
+        (x, y), transmittance, sums = _pixels(chunk.table), before, totals
+        for splat in chunk.parameters():
             transmittance, sums = composite_splat(self.kernels, splat, x, y, transmittance, stop, sums)
         for total, new in zip(totals, sums, strict=True):
             total.copy_(new)
@@ -94,26 +101,23 @@ class Loops:
 
     def backward(
         self,
-        before: Float[Tensor, "G P V"],
+        chunk: Chunk,
         behinds: list[Float[Tensor, "G P V"]],
         gradients: list[Float[Tensor, "G P V"]],
         grad_params: Float[Tensor, "G L V K+probed"],
-        table: Float[Tensor, "N K"],
-        splats: Int32[Tensor, "G L V"],
-        centres: Float[Tensor, "G 2 V"],
     ) -> None:
-        """Go through a chunk back to front.
+        """Go through a chunk back to front, given the gradients of the totals.
 
         Fills ``grad_params``, the gradients of the splats' parameters summed over a tile's pixels, followed by those of
         the first ``n_probed`` due to the first group of features alone, if groups are told apart. Updates ``behinds``,
         one for each group (see :func:`~.kernels.step_back`), to before the chunk.
         """
-        if compiled := _compiled(self, table):
-            outputs = [grad_params, *behinds]
-            arguments = _at(before, table, splats, centres, *outputs, *gradients)
+        before = chunk.before
+        if compiled := _compiled(self, chunk.table):
+            arguments = _at(*chunk, grad_params, *behinds, *gradients)
             compiled.backward(_threads(before), len(before), *arguments)
             return
-        kernels, params, (x, y) = self.kernels, _look_up(table, splats, centres), _pixels(table)
+        kernels, params, (x, y) = self.kernels, chunk.parameters(), _pixels(chunk.table)
         befores, alphas, grad_z = [], [], []
         evaluated = [kernels.evaluate(splat[: kernels.n_shape], x, y) for splat in params]
         for at in evaluated:
@@ -136,15 +140,6 @@ class Loops:
         sums = [each.sum(2) for each in contributions(kernels, at, x, y, *stacked, gradients)]
         columns = splat_gradients(kernels, [each[:, :, 0] for each in shape], sums, self.n_features)
         grad_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
-
-
-def _look_up(
-    table: Float[Tensor, "N K"], splats: Int32[Tensor, "G L V"], centres: Float[Tensor, "G 2 V"]
-) -> list[list[Float[Tensor, "G 1 V"]]]:
-    """Parameters of each splat of a chunk, with u and v relative to the tiles' centres."""
-    u, v, *rest = table[splats].unbind(-1)  # [G L V] each
-    params = torch.stack([u - centres[:, :1], v - centres[:, 1:], *rest])
-    return [list(splat.unbind(0)) for splat in params[:, :, :, None].unbind(2)]
 
 
 def _pixels(table: Tensor) -> tuple[Float[Tensor, "1 P 1"], Float[Tensor, "1 P 1"]]:

@@ -128,4 +128,4 @@ def _render(
     depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
     order = visible.index_select(0, stable_order(depths))
     bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
-    return composite(view.means2d, view.shapes, features, order, bins, kernels, view.probed, n_densifying)
+    return composite(view, features, order, bins, kernels, n_densifying)
