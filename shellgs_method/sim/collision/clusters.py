@@ -8,13 +8,13 @@ convex decomposition of Hertel and Mehlhorn (1983), and around convex corners me
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
+from trimesh.geometry import faces_to_edges
+from trimesh.graph import connected_component_labels
 
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.triangles import Triangles
@@ -64,7 +64,7 @@ class _Piece:
         points = np.concatenate([self.points, other.points])
         area, vector, moment = self.area + other.area, self.vector + other.vector, self.moment + other.moment
         both = _Piece([*self.faces, *other.faces], points, area, vector, moment, 0.0)
-        return _Piece(both.faces, points, area, vector, moment, _air(both))
+        return replace(both, air=_air(both))
 
 
 def _air(piece: _Piece) -> float:
@@ -197,9 +197,7 @@ def _trimmed(piece: _Piece) -> _Piece:
         corners = ConvexHull(np.concatenate([piece.points, behind]), qhull_options=f"Qt W{FINE}").vertices
     except QhullError:
         return piece
-    return _Piece(
-        piece.faces, piece.points[np.unique(corners % len(behind))], piece.area, piece.vector, piece.moment, piece.air
-    )
+    return replace(piece, points=piece.points[np.unique(corners % len(behind))])
 
 
 def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) -> list[Int64[np.ndarray, " G"]]:
@@ -207,10 +205,6 @@ def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) 
     if not len(chosen):
         return []
     corners = faces[chosen]
-    used, numbered = np.unique(corners, return_inverse=True)
-    numbered = numbered.reshape(-1, 3)
-    rows, columns = numbered[:, [0, 1]].ravel(), numbered[:, [1, 2]].ravel()
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(used), len(used)))
-    label = connected_components(graph, directed=False)[1][numbered[:, 0]]
+    label = connected_component_labels(faces_to_edges(corners), node_count=int(corners.max()) + 1)[corners[:, 0]]
     order = np.argsort(label, kind="stable")
     return np.split(chosen[order], np.flatnonzero(np.diff(label[order])) + 1)
