@@ -9,6 +9,14 @@ from typing import Any
 import torch
 
 
+def _binary(sign: str, partials: Callable[..., tuple]) -> Callable[[Symbol, Symbol | float], Symbol]:
+    return lambda a, b: Symbol(f"{{}} {sign} {{}}", a, b, partials=partials)
+
+
+def _comparison(sign: str) -> Callable[[Symbol, Symbol | float], Condition]:
+    return lambda a, b: Condition(f"{{}} {sign} {{}}", a, b)
+
+
 class Symbol:
     """A vector of floats (one float in CUDA): a name or a literal, or an expression of other symbols.
 
@@ -22,17 +30,11 @@ class Symbol:
         self.template, self.partials = template, partials
         self.parts = tuple(each if isinstance(each, Symbol) else literal(each) for each in parts)
 
-    def __add__(self, other: Symbol | float) -> Symbol:
-        return Symbol("{} + {}", self, other, partials=lambda _, g: (g, g))
-
-    def __sub__(self, other: Symbol | float) -> Symbol:
-        return Symbol("{} - {}", self, other, partials=lambda _, g: (g, -g))
-
-    def __mul__(self, other: Symbol | float) -> Symbol:
-        return Symbol("{} * {}", self, other, partials=lambda s, g: (g * s.parts[1], g * s.parts[0]))
-
-    def __truediv__(self, other: Symbol | float) -> Symbol:
-        return Symbol("{} / {}", self, other, partials=lambda s, g: (g / s.parts[1], -(g * s) / s.parts[1]))
+    __add__ = _binary("+", lambda _, g: (g, g))
+    __sub__ = _binary("-", lambda _, g: (g, -g))
+    __mul__ = _binary("*", lambda s, g: (g * s.parts[1], g * s.parts[0]))
+    __truediv__ = _binary("/", lambda s, g: (g / s.parts[1], -(g * s) / s.parts[1]))
+    __gt__, __ge__, __lt__, __le__ = (_comparison(sign) for sign in (">", ">=", "<", "<="))
 
     def __radd__(self, other: float) -> Symbol:
         return literal(other) + self
@@ -48,18 +50,6 @@ class Symbol:
 
     def __neg__(self) -> Symbol:
         return Symbol("-{}", self, partials=lambda _, g: (-g,))
-
-    def __gt__(self, other: Symbol | float) -> Condition:
-        return Condition("{} > {}", self, other)
-
-    def __ge__(self, other: Symbol | float) -> Condition:
-        return Condition("{} >= {}", self, other)
-
-    def __lt__(self, other: Symbol | float) -> Condition:
-        return Condition("{} < {}", self, other)
-
-    def __le__(self, other: Symbol | float) -> Condition:
-        return Condition("{} <= {}", self, other)
 
     def detach(self) -> Symbol:
         """The same without a gradient."""
@@ -95,13 +85,11 @@ def _where(condition: Condition, a: Symbol | float, b: Symbol | float) -> Symbol
     )
 
 
-def _sqrt(x: Symbol) -> Symbol:
-    return Symbol("each<sqrtf>({})", x, partials=lambda s, g: (0.5 * g / s,))
+def _each(function: str, partials: Callable[..., tuple]) -> Callable[[Symbol], Symbol]:
+    return lambda x: Symbol(f"each<{function}>({{}})", x, partials=partials)
 
 
-def _log(x: Symbol) -> Symbol:
-    return Symbol("each<logf>({})", x, partials=lambda s, g: (g / s.parts[0],))
-
+_log = _each("logf", lambda s, g: (g / s.parts[0],))
 
 _FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
     torch.where: _where,
@@ -111,11 +99,11 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
     torch.clamp_min: lambda x, low: _where(x < low, low, x),
     torch.minimum: lambda a, b: _where(a < b, a, b),
     torch.maximum: lambda a, b: _where(a > b, a, b),
-    torch.sqrt: _sqrt,
+    torch.sqrt: _each("sqrtf", lambda s, g: (0.5 * g / s,)),
     torch.log: _log,
     torch.log2: lambda x: _log(x) * (1 / math.log(2)),
-    torch.floor: lambda x: Symbol("each<floorf>({})", x, partials=lambda *_: (None,)),
-    torch.ceil: lambda x: Symbol("each<ceilf>({})", x, partials=lambda *_: (None,)),
+    torch.floor: _each("floorf", lambda *_: (None,)),
+    torch.ceil: _each("ceilf", lambda *_: (None,)),
 }
 
 
