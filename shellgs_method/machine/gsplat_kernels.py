@@ -9,18 +9,15 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar
 
 from filelock import FileLock
 
 from shellgs_method.errors import notice
 from shellgs_method.machine import system
-
-_Result = TypeVar("_Result")
 
 TORCH_COSTS = "some thirty times slower"
 """What a step in plain torch on a GPU is, against one with gsplat's kernels: 35 times (photo-gs, H200, 320 pixels)."""
@@ -28,26 +25,22 @@ CORE_MINUTES = 70
 """Time that one core compiles the kernels for: 35 minutes on two (gsplat 1.4.0, nvcc 13.0, one compute capability)."""
 
 
-def _uninterrupted(function: Callable[[], _Result]) -> Callable[[], _Result]:
-    """Make a function run without the trace hook of its thread, by which nerfstudio's viewer interrupts a render.
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Do without the trace hook of this thread, by which nerfstudio's viewer interrupts a render.
 
     The hook raises at any line, also at those of the compiling, whose errors are explained.
     """
-
-    @functools.wraps(function)
-    def call() -> _Result:
-        hook = sys.gettrace()
-        sys.settrace(None)
-        try:
-            return function()
-        finally:
-            sys.settrace(hook)
-
-    return call
+    hook = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(hook)
 
 
 @functools.cache
-@_uninterrupted
+@_uninterrupted()
 def kernels_fault() -> str | None:
     """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
     if not _come_compiled() and _nvcc() and not are_compiled():
