@@ -373,7 +373,8 @@ class FacadeModel(SplatfactoModel):
         if not isinstance(camera, Cameras):
             refuse(NO_RAYS)
         self._threads.follow()
-        pinhole, background = self._pinhole(camera), self._get_background_color()
+        photograph = (camera.metadata or {}).get("cam_idx") if self.training else None
+        pinhole, background = self._pinhole(camera, photograph), self._get_background_color()
         surface_every = max(1, round(SURFACE_EVERY * self.num_iterations / PAPER_ITERATIONS))
         if self.training and self.step % surface_every == 0:
             self.surface = None
@@ -392,7 +393,6 @@ class FacadeModel(SplatfactoModel):
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
-        photograph = (camera.metadata or {}).get("cam_idx") if self.training else None
         if self.exposures is not None and photograph is not None:
             rgb = exposed(rgb, self.exposures.log_gains[photograph])
         self._unclipped = None if self.training else rgb.detach()
@@ -407,14 +407,13 @@ class FacadeModel(SplatfactoModel):
             outputs["depth"] = depth
         return outputs
 
-    def _pinhole(self, camera: Cameras) -> Camera:
+    def _pinhole(self, camera: Cameras, photograph: int | None) -> Camera:
         """A camera as ours; those of training photographs are kept, as the host waits for the size of one on a GPU."""
-        index = (camera.metadata or {}).get("cam_idx") if self.training else None
-        if index is None:
+        if photograph is None:
             return pinhole_camera(camera)
-        if index not in self._cameras:
-            self._cameras[index] = pinhole_camera(camera)
-        return self._cameras[index]
+        if photograph not in self._cameras:
+            self._cameras[photograph] = pinhole_camera(camera)
+        return self._cameras[photograph]
 
     @property
     def _renders_geometry(self) -> bool:
