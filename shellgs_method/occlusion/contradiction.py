@@ -329,8 +329,8 @@ class _Neighbour:
         self._kept = None if other.kept is None else other.kept.float()
         self.visible = (~hidden).float() * self.kept(self.shell)
         """1 where the shell is visible in the other view: inside what counts of its image, not behind other parts."""
-        self._shown = self._at(self.shell)
-        self.on_shell = self._disagreement(self._shown)
+        self._shown = self._at(self.shell.grid)
+        self.on_shell = _difference(self._shown, self._features)
         """Disagreement of the two photographs on the shell."""
 
     def look(self, offset: Float[Tensor, "h w"] | float) -> _Look:
@@ -352,18 +352,14 @@ class _Neighbour:
         apart = offset.abs() > _APART
         x, y, z = self._surface[:, apart] + offset[apart] * self._start[..., 0]
         grid = (torch.stack([x, y]) / z.clamp_min(1e-9)).T[None, None]
-        there = grid_sample(self._there[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
-        return self.on_shell.masked_scatter(apart, _difference(there, self._features[:, apart]))
+        return self.on_shell.masked_scatter(apart, _difference(self._at(grid)[:, 0], self._features[:, apart]))
 
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
-        return self._disagreement(self._at(look))
+        return _difference(self._at(look.grid), self._features)
 
-    def _at(self, look: _Look) -> Float[Tensor, "5 h w"]:
-        return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
-
-    def _disagreement(self, there: Float[Tensor, "5 h w"]) -> Float[Tensor, "h w"]:
-        return _difference(there, self._features)
+    def _at(self, grid: Float[Tensor, "1 H W 2"]) -> Float[Tensor, "5 H W"]:
+        return grid_sample(self._there[None], grid, padding_mode="border", align_corners=False)[0]
 
 
 def _difference(there: Float[Tensor, "5 *N"], here: Float[Tensor, "5 *N"]) -> Float[Tensor, "*N"]:
