@@ -14,12 +14,11 @@ from torch import Tensor
 from shellgs_method.files.splats import Splats, read_splats
 from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.render.view import ViewRenderer
-from shellgs_method.sim.env.world import HIDDEN, MOVING, World, mujoco
+from shellgs_method.sim.env.world import HIDDEN, MOVING, World
+from shellgs_method.sim.trials.engine import cast_rays
 
 DRAWN = (0, 1, 2, MOVING)
 """Groups of geoms in the camera's image: those that MuJoCo draws, and what moves."""
-STATIC = 0
-"""Rays pass geoms that are fixed to the world: of the groups that are drawn, they meet the robot alone."""
 SKY = 0.7, 0.8, 0.9
 """Colour behind the splats."""
 SUN = np.array([0.3, -0.4, 0.87])
@@ -37,7 +36,7 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 def cast_at_moving(
     model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"], groups: Sequence[int] = (MOVING,)
 ) -> tuple[Float64[np.ndarray, " R"], np.ndarray, Float64[np.ndarray, "R 3"]]:
-    """Cast rays of any length from a point at what moves.
+    """Cast rays of any length from a point at what moves; they pass geoms that are fixed to the world.
 
     Args:
         model: MuJoCo's model.
@@ -53,17 +52,12 @@ def cast_at_moving(
     lengths = np.linalg.norm(rays, axis=1)
     directions = rays / lengths[:, None]
     near = np.flatnonzero(_aimed(model, data, origin, directions, groups))
-    found, hit, normal = np.empty(len(near)), np.zeros(len(near), np.int32), np.zeros((len(near), 3))
-    if len(near):
-        mask = np.isin(np.arange(6), groups).astype(np.uint8)
-        mujoco.mj_multiRay(
-            model, data, origin[:, None], directions[near].reshape(-1, 1), mask, STATIC, -1, hit, found,
-            normal.reshape(-1, 1), len(near), 1e3,
-        )  # fmt: skip
     distances, geoms, normals = np.full(len(rays), np.inf), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
-    distances[near] = np.where(found < 0, np.inf, found / lengths[near])
-    geoms[near], normals[near] = hit, normal
-    return distances, geoms, normals
+    if len(near):
+        distances[near], geoms[near], normals[near] = cast_rays(
+            model, data, origin, directions[near], groups, fixed=False
+        )
+    return distances / lengths, geoms, normals
 
 
 def _aimed(

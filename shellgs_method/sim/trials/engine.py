@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -89,16 +89,28 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
     mujoco, model = import_mujoco(), load(path)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    groups = np.zeros(6, np.uint8)
-    groups[[0, group]] = 1
-    distances = np.empty((len(places), len(rays)))
-    geoms, normals = np.empty(len(rays), np.int32), np.empty((len(rays), 3))
-    for place, row in zip(places, distances, strict=True):
-        mujoco.mj_multiRay(
-            model, data, place[:, None], rays.reshape(-1, 1), groups, 1, -1, geoms, row, normals.reshape(-1, 1),
-            len(rays), 1e3,
-        )  # fmt: skip
-    return np.where(distances < 0, np.inf, distances)
+    return np.stack([cast_rays(model, data, place, rays, (0, group), fixed=True)[0] for place in places])
+
+
+def cast_rays(
+    model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"], groups: Sequence[int], fixed: bool
+) -> tuple[Float64[np.ndarray, " R"], np.ndarray, Float64[np.ndarray, "R 3"]]:
+    """Cast rays in MuJoCo: distance in metres, infinite where nothing is hit, number of the geom, and normal.
+
+    Args:
+        model: MuJoCo's model.
+        data: its state.
+        origin: where the rays begin.
+        rays: unit directions, at least one.
+        groups: of the geoms to hit.
+        fixed: whether geoms that are fixed to the world are hit, too.
+    """
+    distances, geoms, normals = np.empty(len(rays)), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
+    import_mujoco().mj_multiRay(
+        model, data, origin[:, None], rays.reshape(-1, 1), np.isin(np.arange(6), groups).astype(np.uint8), fixed, -1,
+        geoms, distances, normals.reshape(-1, 1), len(rays), 1e3,
+    )  # fmt: skip
+    return np.where(distances < 0, np.inf, distances), geoms, normals
 
 
 def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
