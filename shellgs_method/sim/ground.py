@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 from scipy.optimize import least_squares
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.triangles import Triangles
@@ -314,8 +313,7 @@ def _joined(heights: Float64[np.ndarray, "R C"], reach: int, high: float) -> Boo
         ):
             joined = np.abs(heights[one] - heights[other]) < high
             pairs.append(np.stack([number[one][joined], number[other][joined]]))
-    rows, columns = np.concatenate(pairs, axis=1)
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(heights.size, heights.size))
-    label = connected_components(graph, directed=False)[1].reshape(heights.shape)
+    edges = np.concatenate(pairs, axis=1).T
+    label = connected_component_labels(edges, node_count=heights.size).reshape(heights.shape)
     known = np.isfinite(heights)
     return known & (label == np.bincount(label[known]).argmax())
