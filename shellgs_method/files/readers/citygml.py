@@ -62,6 +62,11 @@ def _name(element: ET.Element) -> str:
     return _OURS.sub("", element.tag)
 
 
+def _kind(element: ET.Element) -> str:
+    """Local name of an element, of any schema."""
+    return element.tag.rpartition("}")[2]
+
+
 class _Model:
     """The objects of a CityGML.
 
@@ -79,7 +84,7 @@ class _Model:
     def objects(self) -> Iterator[CityObject]:
         """The objects of the model, with their parts."""
         for member in self.root:
-            if _name(member).rpartition("}")[2] in _MEMBERS:
+            if _kind(member) in _MEMBERS:
                 for feature in member:
                     made = self._object(feature)
                     yield from made.parts if _name(feature) == "ReliefFeature" else [made]
@@ -112,7 +117,7 @@ class _Model:
         return target
 
     def _object(self, feature: ET.Element) -> CityObject:
-        made = CityObject(_name(feature).rpartition("}")[2])
+        made = CityObject(_kind(feature))
         self._fill(made, feature, "", 0)
         return made
 
@@ -122,7 +127,7 @@ class _Model:
             raise ValueError("its surfaces are parts of themselves")
         own = [(level, p) for p in feature if (level := self._level_of(p, feature)) is not None]
         taken = {id(p) for _, p in own}
-        footprints = [prop for _, prop in own if _name(prop).rpartition("}")[2].startswith("lod0")]
+        footprints = [prop for _, prop in own if _kind(prop).startswith("lod0")]
         self.missing["footprint (LoD 0)"] += bool(footprints)
         for prop in feature:
             if id(prop) in taken or _name(prop) in ("lod", "appearance", "address"):
@@ -131,10 +136,10 @@ class _Model:
                 self.linked(prop) if _name(prop) in ("boundedBy", "boundary", "opening", "fillingSurface") else None
             )
             for child in [*prop] if target is None else [target]:
-                kind = _name(child)
-                if is_surface(kind.rpartition("}")[2]):
-                    self._fill(made, child, kind.rpartition("}")[2], depth + 1)
-                elif child.tag.rpartition("}")[2][:1].isupper() and any(map(self._is_property, child)):
+                kind = _kind(child)
+                if is_surface(kind):
+                    self._fill(made, child, kind, depth + 1)
+                elif kind[:1].isupper() and not all(_kind(part)[:1].isupper() for part in child):
                     part = self._object(child)
                     if part.levels or part.parts:
                         made.parts.append(part)
@@ -146,12 +151,9 @@ class _Model:
             if not polygons:
                 del made.levels[level]
 
-    def _is_property(self, element: ET.Element) -> bool:
-        return not _name(element).rpartition("}")[2][:1].isupper()
-
     def _level_of(self, prop: ET.Element, feature: ET.Element) -> float | None:
         """Level of detail of a property with a geometry; None for other properties."""
-        name = _name(prop).rpartition("}")[2]
+        name = _kind(prop)
         if match := _LEVEL.match(name):
             return float(match[1])
         if name == "tin":
