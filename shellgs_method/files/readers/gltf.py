@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,8 @@ _READ = (
     *("CESIUM_primitive_outline", "EXT_mesh_manifold"),
 )
 """Beginnings of the names of extensions that a file may require."""
+_STILL = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+"""Parts of the pose of a node that says none of them."""
 _MOST = 200_000_000
 """Vertices: instances and sparse values let a small file claim more than any machine holds."""
 
@@ -166,20 +168,16 @@ class _Document:
     def _pose(self, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
         if "matrix" in node:
             return np.array(node["matrix"], np.float64).reshape(4, 4).T
-        parts = node.get("translation", (0, 0, 0)), node.get("rotation", (0, 0, 0, 1)), node.get("scale", (1, 1, 1))
-        return _poses(*(np.array([part], np.float64) for part in parts))[0]
+        return _poses({name: np.array([node[name]], np.float64) for name in _STILL.keys() & node.keys()}, 1)[0]
 
     def _instances(self, node: dict[str, Any]) -> Float64[np.ndarray, "I 4 4"]:
         """Poses of the instances of a node's mesh, relative to the node."""
         if _INSTANCES not in node.get("extensions", {}):
             return np.eye(4)[None]
         attributes = node["extensions"][_INSTANCES]["attributes"]
-        parts = {
-            name: self.accessor(k) for name, k in attributes.items() if name in ("TRANSLATION", "ROTATION", "SCALE")
-        }
+        parts = {name: self.accessor(attributes[name.upper()]) for name in _STILL if name.upper() in attributes}
         count = max(self.listed("accessors")[k]["count"] for k in attributes.values())  # of all the same
-        still = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
-        return _poses(*(parts.get(name, np.tile(np.float64(value), (count, 1))) for name, value in still.items()))
+        return _poses(parts, count)
 
     # Meshes
 
@@ -280,11 +278,10 @@ class _Document:
         return file.read_bytes()
 
 
-def _poses(
-    translation: Shaped[np.ndarray, "I 3"], rotation: Shaped[np.ndarray, "I 4"], scale: Shaped[np.ndarray, "I 3"]
-) -> Float64[np.ndarray, "I 4 4"]:
-    """Matrices that scale, then rotate by a quaternion (x, y, z, w), then translate."""
-    poses = np.tile(np.eye(4), (len(translation), 1, 1))
+def _poses(parts: Mapping[str, Shaped[np.ndarray, "I C"]], count: int) -> Float64[np.ndarray, "I 4 4"]:
+    """Matrices that scale, then rotate by a quaternion (x, y, z, w), then translate, as far as these are given."""
+    translation, rotation, scale = (parts.get(name, np.tile(usual, (count, 1))) for name, usual in _STILL.items())
+    poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None, :]
     poses[:, :3, 3] = translation
     return poses
