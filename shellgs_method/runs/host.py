@@ -74,12 +74,17 @@ def mend_commands() -> None:
 
 
 def _mend_render(render: Any) -> None:
-    """Ns-render checks no camera path that it reads, and starts spirals from listed data managers alone."""
+    """Ns-render checks no camera path that it reads, starts spirals from listed data managers alone, and wants ffmpeg
+    for images, too.
+    """
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
     render.json = SimpleNamespace(load=_camera_path)  # it reads nothing else by it
     render.VanillaDataManager = (VanillaDataManager, FullImageDatamanager)
+    command = _running((render.RenderCameraPath, render.RenderInterpolated, render.SpiralRender))
+    if command and command.output_format == "images":
+        render.install_checks = SimpleNamespace(check_ffmpeg_installed=lambda: None)
 
 
 def _camera_path(file: TextIO) -> dict[str, Any]:
@@ -186,8 +191,8 @@ def _mend_viewer(run_viewer: Any) -> None:
     run_viewer._start_viewer = _before(run_viewer._start_viewer, check, KeyboardInterrupt)
 
 
-def _running(kind: type) -> Any:
-    """The command of a class whose ``main`` is loading the run; None if another one is."""
+def _running(kind: type | tuple[type, ...]) -> Any:
+    """The command of a class, or of one of them, whose ``main`` is loading the run; None if another one is."""
     frame = sys._getframe(1)
     while frame is not None:
         if frame.f_code.co_name == "main" and isinstance(command := frame.f_locals.get("self"), kind):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -128,6 +130,21 @@ def test_a_crop_box_around_nothing_leaves_all_outputs(trainer):
     model.set_crop(None)
     assert {name: image.shape for name, image in nothing.items()} == {name: each.shape for name, each in full.items()}
     assert nothing["accumulation"].max() == 0
+
+
+@pytest.mark.parametrize(("form", "stops"), [("images", False), ("video", True)])
+def test_only_videos_need_an_encoder(loaded, trainer, tmp_path, monkeypatch, form, stops):
+    def load(*_: object, **__: object) -> tuple:
+        mend_commands()  # as the pipeline does
+        return trainer.config, trainer.pipeline, None, 0
+
+    monkeypatch.setattr(render, "eval_setup", load)
+    monkeypatch.setitem(vars(render), "install_checks", vars(render)["install_checks"])
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: sys.exit(1))
+    command = render.SpiralRender(CONFIG, tmp_path / "out", seconds=0.1, output_format=form)
+    with pytest.raises(SystemExit) if stops else nullcontext():
+        command.main()
+    assert any(tmp_path.iterdir()) is not stops
 
 
 def test_a_spiral_is_rendered(loaded, tmp_path):
