@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
-from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import OPENGL, Camera, in_view, positions, project
@@ -60,6 +60,7 @@ _SPECK = 1e-4  # of the extent of the cameras, which is nothing that could be tr
 # Points' colours correlate with those of the photographs that observe them by .7 and more (at night .46), with those of
 # others by 0 to .5, or as much as with their own where the camera hardly moved.
 _OWN, _MORE = 0.6, 0.2
+_MOSTLY = 0.8  # of the points, which nobody ignores to keep people and cars, or even plants, out of a training
 _DRIFTED = 0.01  # of a photograph's sides: points of 450 models are within .003 of their keypoints in the median
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
 
@@ -188,6 +189,11 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
                 f"{points.called} have other colours than the photographs that observe them, as if these were others "
                 "than those of the model: if they are in another order, turned, cropped or others of these names, put "
                 "back those that the cameras were found with."
+            )
+        if (share := _ignored(points, views)) > _MOSTLY:
+            notice(
+                f"masks, or transparent pixels, ignore {share:.0%} of {points.called}, as if they were inverted: white "
+                "is kept, and black is ignored."
             )
         return
     apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
@@ -362,6 +368,22 @@ def _are_others(points: SparsePoints, views: Sequence[View]) -> bool:
             ]
     theirs = _correlation(own)
     return theirs < _OWN and theirs < _correlation(others) + _MORE
+
+
+def _ignored(points: SparsePoints, views: Sequence[View]) -> float:
+    """Share of the points that some views with masks see, or observe, which these masks ignore; 0 of too few."""
+    kept = [np.empty(0, bool)]
+    for view in (views[k] for k in spread(len(views), _PHOTOGRAPHS)):
+        try:
+            mask = load_mask(view)
+        except (SceneError, OSError):  # which is reported where it is used
+            continue
+        if mask is not None:
+            pixels, _ = points.seen_in(view)
+            columns, rows = pixels.astype(int).T
+            kept.append(mask[rows, columns])
+    known = np.concatenate(kept)
+    return 1 - float(known.mean()) if len(known) >= _OBSERVATIONS else 0.0
 
 
 def _at(pixels: Float64[np.ndarray, "N 2"], image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "N 3"]:

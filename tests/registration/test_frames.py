@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -186,6 +187,15 @@ def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, view
     check_points(find_sparse_points(layout), read_views(layout))
     told = "sparse/0 are not where the photographs show them, by their own tracks" in caplog.text
     assert told == (shown != "keypoints of a script")
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_masks_that_ignore_nearly_all_points_are_told(points, views, tmp_path, inverted, caplog):
+    passer_by = np.full((views[0].camera.height, views[0].camera.width), 0 if inverted else 255, np.uint8)
+    passer_by[8:, 20:26] = 255 - passer_by[0, 0]
+    Image.fromarray(passer_by).save(tmp_path / "mask.png")
+    check_points(points, [replace(view, mask=tmp_path / "mask.png") for view in views])
+    assert ("as if they were inverted: white is kept" in caplog.text) == inverted
 
 
 def test_photographs_in_another_order_than_their_tracks_are_told(points, views, caplog):
