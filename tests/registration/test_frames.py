@@ -198,7 +198,7 @@ def test_masks_that_ignore_nearly_all_points_are_told(points, views, tmp_path, i
     assert ("as if they were inverted: white is kept" in caplog.text) == inverted
 
 
-def test_photographs_in_another_order_than_their_tracks_are_told(points, views, caplog):
+def test_photographs_in_another_order_than_their_cameras_are_told(points, views, caplog):
     known = tracked(points, views)
     mixed = [replace(view, image=other.image) for view, other in zip(views, [*views[5:], *views[:5]], strict=True)]
     check_points(replace(known, colours=255 - points.colours // 8), mixed)  # heights, say, tell nothing
@@ -206,7 +206,9 @@ def test_photographs_in_another_order_than_their_tracks_are_told(points, views, 
     check_points(tracked(points, same), same)
     assert not caplog.records
     check_points(known, mixed)
-    assert "the SfM points of sparse/0 have other colours than the photographs that observe them" in caplog.text
+    assert "the SfM points of sparse/0 have other colours than the photographs that see them" in caplog.text
+    check_points(points, mixed)
+    assert "may be in another frame than the cameras, or the photographs in another order" in caplog.text
 
 
 def written_scalar_last(viewmat: np.ndarray) -> np.ndarray:
