@@ -15,6 +15,8 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -214,6 +216,17 @@ class _Capture:
                     add_mask(self.masks.get(name), source, upright, target, as_stored)
                     if not is_whole:
                         add_mask_faces(target, folder, name, self.folder)
+
+    def _said_of_masks(self) -> str:
+        """How much the masks leave of some photographs, for where it was too little; empty without masks."""
+        files = sorted((self.work.folder / "masks").rglob("*.png")) if self.masked else []
+        shares = []
+        for path in files[:: max(1, len(files) // 6)]:
+            with Image.open(path) as mask:
+                shares.append(float(np.mean(np.asarray(mask.convert("L")) > 0)))
+        return (
+            f". The masks keep {np.mean(shares):.0%} of the pixels: white is kept, black is ignored" if shares else ""
+        )
 
     def _said_to_be_panoramas(self) -> set[str]:
         """Names of the sources that are panoramas, by the user's word or by their metadata."""
@@ -428,13 +441,14 @@ class _Capture:
             raise SceneError(
                 f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
                 f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. {advice} out "
-                "photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
+                f"photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
+                f"{self._said_of_masks()}"
             )
         if sees_little:
             raise SceneError(
                 f"the photographs of {self.source} show too little to find cameras by: only {points} points, each in "
                 f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, "
-                f"which show at least {LEAST_SEEN} points each"
+                f"which show at least {LEAST_SEEN} points each{self._said_of_masks()}"
             )
 
     def _tell_of_doubts(self, largest: dict[str, Any]) -> None:

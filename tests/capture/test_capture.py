@@ -1232,6 +1232,19 @@ def answering(answers: dict[str, Any]) -> Any:
     return run_step
 
 
+def test_where_masks_left_too_little_the_refusal_says_how_much(tmp_path, monkeypatch):
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "masks").mkdir()
+    inverted = np.zeros((48, 64), np.uint8)
+    inverted[:, :16] = 255
+    for k in range(3):
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+        Image.fromarray(inverted).save(tmp_path / "masks" / f"{k}.jpg.png")
+    monkeypatch.setattr(stages, "run_step", answering({}))
+    with pytest.raises(SceneError, match=r"only 0 of 3 photographs .* The masks keep 25% of the pixels: white is kept"):
+        capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(masks=tmp_path / "masks"))
+
+
 def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch, caplog):
     for k in range(8):
         (tmp_path / "photographs" / "ab"[k > 4]).mkdir(parents=True, exist_ok=True)
