@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal, Optional
+from typing import TYPE_CHECKING, Any, Literal, Optional
 
 import torch
 from gsplat.strategy.ops import remove
@@ -118,8 +118,8 @@ class FacadeTrainerConfig(TrainerConfig):
         """Name runs after their scene's folder, as it is called: nerfstudio cuts off what follows a dot, and of a scene
         given as ``..`` runs were beside the output folder.
         """
-        if self.experiment_name is None and (scene := self.pipeline.datamanager.data) is not None:
-            self.experiment_name = Path(os.path.abspath(scene)).name
+        if self.experiment_name is None:
+            self.experiment_name = Path(os.path.abspath(self._given_scene().data)).name
         super().set_experiment_name()
 
     def save_config(self) -> None:
@@ -133,8 +133,16 @@ class FacadeTrainerConfig(TrainerConfig):
                     f"another training, which may have begun in the same second, writes to {folder}: begin again, or "
                     "name the folder by --timestamp"
                 )
+            if self.output_dir.is_absolute() or not Path(os.path.abspath(folder)).is_relative_to(Path.cwd()):
+                given = self._given_scene()  # from there, the way to a relative path is not known
+                given.data = Path(os.path.abspath(given.data))
             write_whole(folder / "config.yml", written_config(self))
         tell("Reading the scene")
+
+    def _given_scene(self) -> Any:
+        """What holds the scene's path as ``data``: the parser, where it is given behind its name or not at all."""
+        manager: Any = self.pipeline.datamanager
+        return manager.dataparser if manager.data is None else manager
 
 
 class FacadeTrainer(Trainer):

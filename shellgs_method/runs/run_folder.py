@@ -64,7 +64,8 @@ def open_run(path: Path, find_scene: bool = True) -> TrainerConfig:
     if given := getattr(model, "coarse", None):
         model.coarse = _find(given, written, folder) or given
     manager: Any = config.pipeline.datamanager
-    stored = manager.data or getattr(getattr(manager, "dataparser", None), "data", None)
+    parser = getattr(manager, "dataparser", None)
+    stored = manager.data or getattr(parser, "data", None)
     if stored is None:  # a method that needs no scene
         return config
     manager.data = _find(stored, written, folder)
@@ -75,6 +76,8 @@ def open_run(path: Path, find_scene: bool = True) -> TrainerConfig:
             f"there, or correct `data` in {path}"
         )
     manager.data = manager.data or stored
+    if parser is not None and parser.data == stored:  # given behind the parser's name
+        parser.data = manager.data
     return config
 
 

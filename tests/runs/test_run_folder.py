@@ -22,6 +22,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.locks import held
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.config_file import load_config
+from shellgs_method.runs.limits import check_training
 from shellgs_method.runs.run_folder import open_run
 from shellgs_method.runs.trained import load_run
 
@@ -141,6 +142,25 @@ def test_the_scene_is_that_of_the_run_not_that_of_the_working_directory(two_proj
     assert scene_of(open_run(a / NAMES / "config.yml")) == a / "scene"
     assert scene_of(open_run(Path("../a") / NAMES / "config.yml")) == a / "scene"
     assert scene_of(open_run(NAMES / "config.yml")) == b / "scene"
+
+
+@pytest.mark.parametrize("parser", [False, True])
+@pytest.mark.parametrize("data", [".", "../facade"])
+@pytest.mark.parametrize("output_dir", ["../elsewhere/outputs", "outputs", "{}/outputs", "{}/facade/outputs"])
+def test_the_scene_is_found_from_anywhere_wherever_outputs_are(tmp_path, monkeypatch, output_dir, data, parser):
+    """Given behind the parser's name, too: from elsewhere, ``.`` was another folder, and resuming found two scenes."""
+    (tmp_path / "facade").mkdir()
+    monkeypatch.chdir(tmp_path / "facade")
+    config = copy.deepcopy(all_methods["photo-gs"])
+    config.output_dir, config.timestamp = Path(output_dir.format(tmp_path)), "run"
+    manager = config.pipeline.datamanager
+    (manager.dataparser if parser else manager).data = Path(data)
+    config.save_config()
+    monkeypatch.chdir(tmp_path)
+    (run,) = tmp_path.rglob("facade/photo-gs/run/config.yml")
+    found = open_run(run)
+    assert scene_of(found) == tmp_path / "facade"
+    check_training(found)
 
 
 @pytest.mark.parametrize("absolute", [True, False])
