@@ -23,9 +23,12 @@ from shellgs_method.files.transfer import WIDE, narrowed, tone_mapped
 from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
+from shellgs_method.geometry.spread import spread
 
 BLACK = 16
 """Brightest of 256 levels in a photograph that shows nothing: that of 12 bits stored as 16."""
+_SMALL, _COMPARED, _FEW = 400, 8, 3  # pixels of the longer side, and photographs, in which borders are looked for
+_BORDER, _BORDERED = 3, 0.003  # brightest of a border's 256 levels; share of the pixels, of which in 60 scenes none is
 _SCALED = 0.1
 """Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
 _OTHERS = (".exr", ".hdr", ".jxl", ".jxr")
@@ -259,6 +262,31 @@ def read_mask(path: Path) -> Image.Image:
         mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
     mask.info["exif"] = exif.tobytes()
     return mask
+
+
+def tell_of_borders(views: Sequence[View], scene: Path) -> None:
+    """Tell the user if photographs, of which some are looked at, have the same borders in black.
+
+    Programs that undistort photographs leave corners where these show nothing, and editors letterboxes; a night's sky
+    is nowhere black in all photographs.
+    """
+    black, compared = None, 0
+    for view in (views[k] for k in spread(len(views), _COMPARED)):
+        small = replace(view, camera=view.camera.shrunk(_SMALL))
+        try:
+            pixels, mask = load_photograph(small), load_mask(small)
+        except (SceneError, OSError):  # which is told where it is used
+            continue
+        own = pixels.max(axis=2) <= _BORDER
+        if mask is not None:
+            own &= mask
+        if black is None or black.shape == own.shape:
+            black, compared = own if black is None else black & own, compared + 1
+    if black is not None and compared >= _FEW and (share := black.mean()) > _BORDERED:
+        notice(
+            f"the photographs of {scene} are black in the same {share:.1%} of their pixels, as in borders of programs "
+            "that undistort, or in a time stamp, which are trained on as a part of the scene: mask them."
+        )
 
 
 def exif_log_gains(paths: Sequence[Path]) -> Float64[np.ndarray, " V"]:

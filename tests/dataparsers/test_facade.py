@@ -790,6 +790,22 @@ def test_a_colmap_model_may_be_in_the_scene_folder_itself(scene):
     assert read_views(FacadeDataParserConfig(data=scene))[0].name == "frame_00001.png"
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_photographs_with_the_same_black_borders_are_told(scene, masked, caplog):
+    """As Metashape leaves them where it undistorts; none are told of the scene as it is."""
+    parse(scene)
+    assert "black in the same" not in caplog.text
+    kept = np.full((32, 48), 255, np.uint8)
+    kept[:3], kept[:, -4:] = 0, 0
+    (scene / "masks").mkdir()
+    for path in sorted((scene / "images").iterdir()):
+        pixels = np.array(Image.open(path).convert("RGB"))
+        Image.fromarray(np.minimum(pixels, kept[..., None])).save(path)
+        Image.fromarray(kept if masked else np.full_like(kept, 255)).save(scene / "masks" / f"{path.name}.png")
+    parse(scene)
+    assert ("are black in the same 16.9% of their pixels" in caplog.text) == (not masked)
+
+
 def test_a_text_model_may_have_other_letters_in_its_names_and_windows_encoding(scene):
     write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
     for name, other in (("cameras", "Cameras.TXT"), ("images", "images.txt"), ("points3D", "points3d.txt")):
