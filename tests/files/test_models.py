@@ -155,6 +155,19 @@ def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
     assert "left out what is no outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
 
 
+@pytest.mark.parametrize("value", [-1, 999])
+def test_polygons_whose_surface_is_none_of_the_list_are_read(tmp_path: Path, value: int):
+    """Python takes -1 for the last of a list."""
+    document = made.cityjson(house())
+    (geometry,) = document["CityObjects"]["a"]["geometry"]
+    geometry["semantics"]["surfaces"].append({"type": "ClosureSurface"})
+    known = read_geometry(made.save_json(tmp_path / "a.json", document))
+    geometry["semantics"]["values"] = [value] * len(house())
+    found = read_geometry(made.save_json(tmp_path / "a.json", document))
+    np.testing.assert_array_equal(found.faces, known.faces)
+    assert (found.classes == SurfaceClass.OTHER).all()
+
+
 @pytest.mark.parametrize("inside", ["CeilingSurface", "ClosureSurface"])
 def test_a_roof_is_read_where_what_is_not_seen_has_its_outline(tmp_path: Path, inside: str):
     ceiling = [Face([face.rings[0][::-1]], inside) for face in house() if face.surface == "RoofSurface"]

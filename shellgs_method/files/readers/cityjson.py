@@ -154,7 +154,9 @@ def _flattened(
         if depth:
             yield from _flattened(boundary, value, depth - 1, vertices, surfaces)
         elif boundary:
-            surface = "" if value is None else str(surfaces[value]["type"]).lstrip("+")
+            surface = ""  # also of a number of none, as -1, which programs write
+            if isinstance(value, int) and 0 <= value < len(surfaces):
+                surface = str(surfaces[value]["type"]).lstrip("+")
             yield Polygon([ring_of(_at(vertices, ring)) for ring in boundary], surface)
 
 
