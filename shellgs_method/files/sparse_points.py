@@ -107,20 +107,26 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
     if not any(observed.values()):
         return _warned(SparsePoints(positions, None, colours, called), layout)
     seen = {images[k].name: np.array(list(of), dtype=int) for k, of in observed.items()}
-    features = {images[k].name: _features(model, k, list(of.values())) for k, of in observed.items()}
+    features = {
+        images[k].name: _features(model, k, points.ids[kept[[*of]]], list(of.values())) for k, of in observed.items()
+    }
     return _warned(SparsePoints(positions, seen, colours, called, features), layout)
 
 
-def _features(model: colmap.Model, number: int, keypoints: list[int]) -> Float64[np.ndarray, "M 2"]:
-    """Where a photograph of a model has these of its keypoints, in shares of its width and height.
+def _features(
+    model: colmap.Model, number: int, points: Int[np.ndarray, " M"], keypoints: list[int]
+) -> Float64[np.ndarray, "M 2"]:
+    """Where a photograph of a model has these points, by their tracks' keypoints, in shares of its width and height.
 
-    NaN where that is unknown, or all are in one place, as of scripts that write some, as the format wants them.
+    NaN where that is unknown, as the keypoint is of another point: OpenMVG writes its own numbers of them into tracks.
+    Likewise where all are in one place, as of scripts that write some, as the format wants them.
     """
     image, numbers = model.images[number], np.array(keypoints, dtype=int)
     found = np.full((len(numbers), 2), np.nan)
     with suppress(ValueError):  # they are damaged
-        pixels = image.features["xy"]
-        there = (numbers >= 0) & (numbers < len(pixels))
+        pixels, of = image.features["xy"], image.features["point"]
+        there = np.flatnonzero((numbers >= 0) & (numbers < len(pixels)))
+        there = there[of[numbers[there]] == points[there]]
         found[there] = pixels[numbers[there]]
         if len(pixels) and not np.ptp(pixels, axis=0).any():
             found[:] = np.nan
