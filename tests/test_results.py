@@ -133,7 +133,7 @@ def test_a_stopped_grid_resumes_with_what_is_missing(trainings, tmp_path):
 def test_the_settings_in_a_file_are_those_that_are_not_the_methods_own(trainings, tmp_path):
     measured(TINY.cells[:1], tmp_path)
     settings = json.loads(TINY.cells[0].file(tmp_path / "results").read_text())["settings"]
-    assert settings.keys() == {"cameras", "photographs", "masks", "shell maps", "truth maps"}
+    assert settings.keys() == {"cameras", "photographs", "masks", "left out", "shell maps", "truth maps"}
 
 
 def test_a_run_of_other_code_starts_anew(trainings, tmp_path):

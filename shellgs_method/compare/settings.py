@@ -21,6 +21,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, fingerprint
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.transforms import find_cloud
+from shellgs_method.occlusion import Displaced
 
 _IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
@@ -77,7 +78,10 @@ def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
-    """Hashes of what a run reads from its scene: photographs, masks, cameras, points and the sources of its maps."""
+    """What a run reads from its scene: hashes of photographs, masks, cameras, points and the sources of its maps.
+
+    Photographs that are left out of the training are named: the user may say that some are right.
+    """
     dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
     if not isinstance(dataparser, FacadeDataParserConfig):
         dataparser = FacadeDataParserConfig()
@@ -87,6 +91,7 @@ def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
         "cameras": fingerprint(*map(_hash, _camera_files(dataparser))),
         "photographs": fingerprint(*([view.name, _hash(view.image)] for view in views)),
         "masks": fingerprint(*([view.name, _hash(view.mask)] for view in views if view.mask)),
+        "left out": ", ".join(sorted(Displaced.read(scene).wrong)),
     }
     model = config.pipeline.model
     # Maps that every method is measured against, including checked maps, and those that this one is trained on.

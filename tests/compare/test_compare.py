@@ -51,6 +51,7 @@ from shellgs_method.files.scene import SceneLayout, ScenePaths
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.launch import cluster, display, local
 from shellgs_method.launch.local import CommandError, follow, launch_locally
+from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.pipeline import FacadePipeline
 
 COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
@@ -675,12 +676,21 @@ def move_points(path: Path) -> None:
     cloud.export(path)
 
 
+def displace(path: Path) -> None:
+    Displaced(10, {"images/frame_00005.png": [9, 0]}).write(path.parents[2])
+
+
 @pytest.mark.usefixtures("fake_commands")
 @pytest.mark.parametrize(
     ("file", "change", "what"),
-    [("images/frame_00003.png", repaint, "photographs"), ("sparse_pc.ply", move_points, "cameras")],
+    [
+        ("images/frame_00003.png", repaint, "photographs"),
+        ("sparse_pc.ply", move_points, "cameras"),
+        (DISPLACED, displace, "left out"),
+    ],
 )
 def test_a_run_whose_photographs_or_points_changed_is_refused(scene, tmp_path, file, change, what):
+    (scene / DISPLACED).parent.mkdir(parents=True, exist_ok=True)
     finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
     change(scene / file)
     with pytest.raises(SceneError, match=rf"other settings \({what}: "):
