@@ -88,6 +88,8 @@ def distort_pixels(
     """Pixels of the pinhole camera with intrinsics ``K`` in the distorted image; undoes :func:`undistort_pixels`."""
     import cv2
 
+    if len(pixels) == 0:  # which OpenCV refuses
+        return pixels
     k1, k2, k3, k4, p1, p2 = lens.distortion
     calibrated, rays = lens.K.double().numpy(), (pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
     if lens.fisheye:

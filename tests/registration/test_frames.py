@@ -153,6 +153,11 @@ def test_points_at_their_keypoints_are_accepted_in_silence(points, views, caplog
         (bent, [replace(view, lens=lens) for view in views]),
     ):
         check_points(known, seen)
+    assert bent.observed is not None
+    unseen = replace(bent, observed={**bent.observed, views[0].name: np.empty(0, int)})
+    unseen = replace(unseen, features={**bent.features, views[0].name: np.empty((0, 2))})
+    for of in (lens, replace(lens, fisheye=True)):
+        check_points(unseen, [replace(views[0], lens=of), *(replace(view, lens=lens) for view in views[1:])])
     assert not caplog.records
     check_points(bent, views)
     assert "not where the photographs show them, by their own tracks, but" in caplog.text
