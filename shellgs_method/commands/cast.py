@@ -226,8 +226,8 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         name, pixels = displaced.farthest
         few = (
             "Their cameras are wrong, or are those of other photographs, unless something hides most of the building "
-            "there: they are not trained on. Find their cameras anew, or take those that are right out of "
-            f"{scene / DISPLACED}."
+            "there, such as a house that the shell lacks: they are not trained on. Find their cameras anew, or take "
+            f"those that are right out of {scene / DISPLACED}."
         )
         if measured := displaced.wrong & held_out:
             few += f" What is measured in those that are held out, such as {min(measured)}, says nothing of a method."
