@@ -15,7 +15,7 @@ from shellgs_method.files.exif import exif_of
 from shellgs_method.files.transfer import HDR, WIDE, Transfer, srgb
 
 _ADOBE = "R03"  # interoperability index of a camera's file in Adobe RGB (DCF 2.0), which embeds no profile
-_SAME_GAMMA = 0.05  # of PNG's usual 1 / 2.2, to which programs round it
+_SAME_GAMMA = 0.15  # of PNG's usual 1 / 2.2: older FFmpeg says 1 / 1.96 of frames of video, which players show as sRGB
 _ALIKE = 2  # levels of 8 bits, to which profiles of sRGB differ
 _CODES = {  # where files that Pillow says nothing of have the codes of their primaries and their transfer function
     "AVIF": re.compile(rb"colrnclx(..)(..)", re.DOTALL),

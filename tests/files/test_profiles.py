@@ -51,10 +51,14 @@ def test_adobe_rgb_of_a_camera_is_known_by_its_exif_data(tmp_path, stored):
 
 
 @pytest.mark.parametrize(
-    ("gamma", "more", "shown"), [(1.0, {}, 188), (1.0, {"sRGB": b"\0"}, 128), (0.45455, {}, 128), (0.5, {}, 137)]
+    ("gamma", "more", "shown"),
+    [(1.0, {}, 188), (1.0, {"sRGB": b"\0"}, 128), (0.45455, {}, 128), (0.50994, {}, 128), (0.55556, {}, 147)],
 )
 def test_a_png_of_another_gamma_is_converted(tmp_path, gamma, more, shown):
-    """As browsers do: 1 is linear light, as renderers write it; a chunk that says sRGB counts before it."""
+    """As browsers do: 1 is linear light, as renderers write it; a chunk that says sRGB counts before it.
+
+    Frames of video, of which FFmpeg said 0.50994 until it was 0.45455, are as players show them.
+    """
     chunks = PngImagePlugin.PngInfo()
     for name, data in {"gAMA": round(1e5 * gamma).to_bytes(4, "big"), **more}.items():
         chunks.add(name.encode(), data)
