@@ -74,6 +74,16 @@ def test_what_too_little_is_known_of_is_not_displaced():
     assert not displacements(far, ALL).any()
 
 
+def test_what_hides_most_of_a_wall_that_fills_little_of_the_photograph_does_not_displace_it():
+    """As a tree at the end of a street."""
+    views, hidden = row(), gaussian_filter(RNG.normal(size=(HEIGHT, WIDTH)), 5)
+    depth = torch.zeros(HEIGHT, WIDTH)
+    depth[40:75, 60:95] = WALL
+    image = torch.from_numpy(0.5 + hidden).float()[..., None].expand(-1, -1, 3)
+    views[4] = views[4]._replace(image=image, depth=depth)
+    assert not displacements(views, ALL).any()
+
+
 def test_photographs_of_glass_that_mirrors_are_not_displaced():
     mirrored = [gaussian_filter(RNG.normal(size=(HEIGHT, WIDTH)), 5) for _ in ALL]
     views = [
