@@ -245,7 +245,8 @@ def _is_model(folder: Path) -> bool:
 
 def _file(folder: Path, name: str) -> Path | None:
     """A file of a model, binary if there are both, its name in any letters, as points3d.txt; None if it is missing."""
-    there = {path.name.lower(): path for path in sorted(folder.glob("*"), reverse=True) if path.is_file()}
+    exact_last = sorted(folder.glob("*"), key=lambda path: (path.stem == name, path.name))
+    there = {path.name.lower(): path for path in exact_last if path.is_file()}
     return there.get(f"{name.lower()}.bin", there.get(f"{name.lower()}.txt"))
 
 

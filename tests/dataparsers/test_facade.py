@@ -817,6 +817,14 @@ def test_a_text_model_may_have_other_letters_in_its_names_and_windows_encoding(s
     assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
 
 
+def test_of_files_of_a_model_whose_names_differ_in_letters_colmaps_own_is_read(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    for other in ("Cameras.txt", "Images.txt", "points3d.txt", "Points3D.txt"):
+        (scene / "sparse" / "0" / other).write_text("# of another program\n")
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
+
+
 def test_whole_numbers_of_a_text_model_may_have_decimals(scene):
     write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
     for name, old, new in (("cameras", " 48 32 ", " 48.0 32.0 "), ("points3D", " 9 9 9 ", " 9.0 9.0 9.0 ")):
