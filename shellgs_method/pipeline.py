@@ -194,8 +194,10 @@ class FacadePipeline(VanillaPipeline):
         """Find the exposures of the scene's photographs by their names: some may have been taken out since training."""
         ours = self.model.exposures
         if ours is not None and self.test_mode != "val" and len(ours.parameter) == len(trained_on):
-            rows = {stem(name): row for row, name in enumerate(trained_on)}
-            ours.use([rows.get(stem(view.name)) for view in self.datamanager.train_dataset.views])
+            rows = {name: row for row, name in enumerate(trained_on)}
+            others = {stem(name): row for name, row in rows.items()}  # of another folder or format
+            views = self.datamanager.train_dataset.views
+            ours.use([rows.get(view.name, others.get(stem(view.name))) for view in views])
 
     def get_train_loss_dict(self, step: int):
         """One step on the next view."""

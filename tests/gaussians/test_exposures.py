@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -182,6 +183,23 @@ def test_photographs_keep_their_exposures_when_one_is_taken_out_of_the_scene(cha
     again = TrainedRun.load(config).log_gains()[:8]
     np.testing.assert_array_equal(np.delete(again, 1, axis=0), without)
     assert np.isfinite(again[1]).all()
+
+
+def test_photographs_of_one_name_in_two_folders_keep_their_own_exposures(changing, tmp_path):
+    """As of two cameras of a rig, whose names are as one without the folder."""
+    scene = Path(shutil.copytree(changing, tmp_path / "scene"))
+    cameras = json.loads((scene / "transforms.json").read_text())
+    for number, frame in enumerate(sorted(cameras["frames"], key=lambda frame: frame["file_path"])):
+        moved = f"{'left' if number < 5 else 'right'}/{number % 5}.png"
+        (scene / moved).parent.mkdir(exist_ok=True)
+        (scene / frame["file_path"]).rename(scene / moved)
+        frame["file_path"] = moved
+    (scene / "transforms.json").write_text(json.dumps(cameras))
+    trainer = trainer_of(scene, tmp_path / "run", "photo_gs", iterations=4, change=learned)
+    trainer.config.save_config()
+    trainer.train()
+    again = TrainedRun.load(trainer.base_dir / "config.yml").log_gains()[:8]
+    np.testing.assert_array_equal(again, log_gains(trainer))
 
 
 def test_a_resumed_run_has_the_same_exposures(changing, tmp_path, trained):
