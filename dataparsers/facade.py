@@ -94,9 +94,7 @@ class FacadeDataParser(DataParser):
         shell = cues["shell"].manifest if "shell" in cues else None
         sized = shell or (cues["mono"].manifest if "mono" in cues else None)
         max_image_size = _image_size(config, sized.max_image_size if sized else None)
-        whole = _of_split(recording, split, config)
-        if split == "train":
-            whole = _without_wrong_cameras(recording, whole, config.data)
+        whole = _used(recording, split, config)
         chosen, cell = _of_block(recording, whole, split, config)
         used = chosen if config.block else range(len(recording.frames))
         there = _on_disk(recording.frames, used, config.data)
@@ -290,22 +288,24 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
             f"{added[0]}: run `shellgs blocks {config.data}` again"
         )
     for split in ("train", "test"):
-        of_split = _of_split(recording, split, config)
+        of_split = _used(recording, split, config)
         for cell in cells:
             _of_cell(cell, recording, of_split, split, path)
     return cells
 
 
-def _without_wrong_cameras(recording: Recording, used: Sequence[int], scene: Path) -> list[int]:
-    """Indices of those photographs that are to be trained on: without those that `shellgs cast` found displaced."""
+def _used(recording: Recording, split: str, config: FacadeDataParserConfig) -> list[int]:
+    """Indices of the photographs of a split; of training ones, without those that `shellgs cast` found displaced."""
+    used, scene = _of_split(recording, split, config), config.data
+    if split != "train":
+        return used
     wrong = Displaced.read(scene).wrong
-    right = [k for k in used if recording.frames[k].name not in wrong]
-    if left_out := [recording.frames[k].name for k in sorted({*used} - {*right})]:
+    if left_out := [recording.frames[k].name for k in used if recording.frames[k].name in wrong]:
         notice(
             f"{len(left_out)} of {len(used)} photographs of {scene} are not trained on, as their cameras are wrong: "
             f"{_some(left_out)}. To train on one all the same, take it out of {scene / DISPLACED}."
         )
-    return right
+    return [k for k in used if recording.frames[k].name not in wrong]
 
 
 def _on_disk(frames: Sequence[Frame], used: Sequence[int], scene: Path) -> list[int]:

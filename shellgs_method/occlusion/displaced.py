@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float64, Int
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json, write_whole
+from shellgs_method.files.map_files import is_number
 from shellgs_method.occlusion.exposure import Exposed, points_on_surface, sightings_on_surface
 
 DISPLACED = "cues/checked/displaced.json"
@@ -85,6 +86,12 @@ class Displaced:
     photographs: int = 0
     pixels: dict[str, list[int]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Refuse what the json may hold besides: it is edited by hand."""
+        pixels = self.pixels.values() if isinstance(self.pixels, dict) else [None]
+        if not (is_number(self.photographs) and all(map(_is_pair, pixels))):
+            raise TypeError
+
     @classmethod
     def read(cls, scene: Path) -> Displaced:
         """Those of a scene; none if it was not looked for them.
@@ -98,7 +105,9 @@ class Displaced:
         try:
             return cls(**read_json(path))
         except TypeError as error:
-            raise SceneError(f"{path} is damaged: delete {path.parent}, and cast again") from error
+            raise SceneError(
+                f"{path} is damaged, or of another version: delete {path.parent}, and cast again"
+            ) from error
 
     def write(self, scene: Path) -> None:
         """Store them in the scene."""
@@ -114,6 +123,10 @@ class Displaced:
     def farthest(self) -> tuple[str, float]:
         """Name of the one that is displaced most, and by how many pixels."""
         return max(((name, math.hypot(*moved)) for name, moved in self.pixels.items()), key=lambda each: each[1])
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
 
 
 def _displacement(

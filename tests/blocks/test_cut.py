@@ -23,6 +23,7 @@ from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.synthetic import StreetConfig
 from shellgs_method.synthetic.appearance import rays
 from shellgs_method.synthetic.houses import Street
@@ -291,6 +292,16 @@ def test_cuts_of_other_cameras_are_refused(scene: Path):
     for read in (trainable_cells, lambda _: parse(scene, block="block-1"), lambda _: command(scene)):
         with pytest.raises(SceneError, match=refused):
             read(layout)
+
+
+def test_a_block_of_displaced_photographs_alone_is_refused_before_anything_is_trained(scene: Path):
+    command(scene, length=6.0, overlap=1.0)
+    layout = FacadeDataParserConfig(data=scene)
+    block = trainable_cells(layout)[0].block
+    (scene / DISPLACED).parent.mkdir(parents=True, exist_ok=True)
+    Displaced(100, {name: [9, 0] for name in block.photographs}).write(scene)
+    with pytest.raises(SceneError, match=f"{block.name} has no photograph to train on"):
+        trainable_cells(layout)
 
 
 def test_photographs_that_were_added_since_a_scene_was_cut_are_not_left_out_of_all_blocks(scene: Path):

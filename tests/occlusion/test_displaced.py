@@ -154,7 +154,16 @@ def test_what_is_measured_in_a_held_out_photograph_of_a_wrong_camera_is_told_to_
     assert f"held out, such as images/{photographs[8].name}, says nothing of a method" in told
 
 
-@pytest.mark.parametrize("content", ['{"images/0.png": [9, 0]}', '["images/0.png"]', "{"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"images/0.png": [9, 0]}',
+        '{"pixels": null}',
+        '{"photographs": 9, "pixels": {"0.png": [null, 0]}}',
+        '["images/0.png"]',
+        "{",
+    ],
+)
 def test_a_damaged_file_of_displaced_photographs_is_refused(tmp_path: Path, content: str):
     path = tmp_path / DISPLACED
     path.parent.mkdir(parents=True)
