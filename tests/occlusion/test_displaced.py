@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from dataparsers.facade import FacadeDataParserConfig, held_out_names
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.occlusion import DISPLACED, Displaced
+from shellgs_method.occlusion import DISPLACED, Displaced, displaced
 from shellgs_method.occlusion.displaced import displacements
 from shellgs_method.occlusion.exposure import Exposed
 
@@ -45,6 +45,13 @@ def test_a_displaced_photograph_is_found_with_its_displacement_and_no_other_is(m
     expected = np.zeros((len(ALL), 2))
     expected[moved[0]] = np.array(moved[1:]) / WIDTH
     np.testing.assert_allclose(displacements(row(moved), ALL), expected)
+
+
+def test_a_displaced_photograph_of_many_is_found_by_the_few_points_that_each_has(monkeypatch):
+    monkeypatch.setattr(displaced, "_MOST", 300 * len(ALL) ** 2)
+    found = displacements(row((4, 9, 0)), ALL)
+    np.testing.assert_allclose(found[4] * WIDTH, [9, 0], atol=1)
+    assert not found[ALL.nonzero()[0] != 4].any()
 
 
 def test_right_photographs_are_where_they_are_whatever_hides_the_wall_in_one():
