@@ -385,7 +385,7 @@ class _Capture:
                 source.backup(target)
             where: dict[str, Any] = {"database": copy, "photographs": self.folder, "model": folder}
             found = self._step("mount", "finding the rig", len(self.names), prefixes=self.rig, **where)
-        self.work.drop("rig")
+        self.work.clear("rig")
         if "loose" in found:
             prefix, turned, moved = found["loose"]
             how = f"turned by {turned:.1f}° and moved by {moved:.1f} steps" if moved else "never found together"
@@ -496,7 +496,7 @@ class _Capture:
         if self._missing_parts():  # deleted after an earlier capture
             self._undistort("restored", summary)
             self._move("restored")
-            self.work.drop("restored")
+            self.work.clear("restored")
 
     def _undistort(self, product: str, summary: Summary) -> None:
         with self.work.making(product, self.model_key) as folder:

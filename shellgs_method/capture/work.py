@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import read_json, write_whole
 from shellgs_method.files.paths import is_hidden
+from shellgs_method.files.record import Record
 
 _RECORD = "record.json"
 
@@ -25,47 +24,35 @@ class Work:
     def __init__(self, folder: Path):
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self._file = folder / _RECORD
-        self._keys: dict[str, str] = {}
-        with suppress(SceneError, FileNotFoundError):  # missing or damaged: everything is made again
-            self._keys = read_json(self._file)
+        self._record = Record(folder / _RECORD)
 
     def has(self, product: str, key: str) -> bool:
         """Whether the product exists and was made with this key."""
-        return self._keys.get(product) == key and (self.folder / product).exists()
+        return self._record.has(product, key) and (self.folder / product).exists()
 
     @contextmanager
     def making(self, product: str, key: str) -> Iterator[Path]:
         """Yield an empty folder, which becomes the product at the end of the context."""
-        part = self._cleared(f"{product}.part")
+        part = self.clear(f"{product}.part")
         part.mkdir()
         yield part
-        os.replace(part, self._cleared(product))
-        self._record(product, key)
+        os.replace(part, self.clear(product))
+        self._record.note(product, key)
 
     def growing(self, product: str, key: str) -> Path:
         """Folder of a product that can be resumed; empty if the key has changed."""
         if not self.has(product, key):
-            self._cleared(product).mkdir()
-            self._record(product, key)
+            self.clear(product).mkdir()
+            self._record.note(product, key)
         return self.folder / product
 
-    def drop(self, product: str) -> None:
-        """Delete a product."""
-        self._cleared(product)
-
-    def _cleared(self, product: str) -> Path:
-        self._record(product, None)  # first: a product must never have another's key
+    def clear(self, product: str) -> Path:
+        """Delete a product; return where it was."""
+        self._record.forget(product)  # first: a product must never have another's key
         path = self.folder / product
         if path.exists():
             shutil.rmtree(path)
         return path
-
-    def _record(self, product: str, key: str | None) -> None:
-        self._keys.pop(product, None)
-        if key is not None:
-            self._keys[product] = key
-        write_whole(self._file, json.dumps(self._keys, indent=1) + "\n")
 
 
 def refuse_foreign(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -26,8 +25,9 @@ from shellgs_method.commands.sim import check_packages
 from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import content_hash, fingerprint, read_json, write_whole
+from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
 from shellgs_method.files.locks import alone_in
+from shellgs_method.files.record import Record
 from shellgs_method.files.scene import ALIGNMENT
 
 if TYPE_CHECKING:
@@ -174,103 +174,62 @@ def run(
     scene = scene if scene.name not in ("", "..") else scene.resolve()
     recipe = _settled(recipe, scene.with_name(f"{scene.name}.run"))
     results = scene.with_name(f"{scene.name}-results")
-    steps = _Steps(results / "steps", total=5 + recipe.sim)
-    with alone_in(steps.folder, f"another run of {scene} is going on: wait for it"):
-        if not steps.changed("all", *_state(recipe, scene, results)):
+    steps = results / "steps"
+    steps.mkdir(parents=True, exist_ok=True)
+    with alone_in(steps, f"another run of {scene} is going on: wait for it"):
+        done = Record(steps / "done.json")
+        if done.has("all", _state(recipe, scene, results)):
             (trained,) = (results / "runs").glob(f"*/*/{recipe.method}/*/config.yml")
             console.print("Nothing is left to do.")
         else:
-            trained = _take(steps, recipe, scene, results, accept)
-            steps.done("all", *_state(recipe, scene, results))
+            trained = _take_all_steps(recipe, scene, results, accept, done)
+            done.note("all", _state(recipe, scene, results))
     console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", soft_wrap=True)
     page = trained.with_name("splats.html")
     viewer = f"ns-viewer --load-config {shlex.quote(str(trained))}"
     console.print(f"Walk around: {page}, or {viewer}", soft_wrap=True)
 
 
-def _state(recipe: Recipe, scene: Path, results: Path) -> list[object]:
-    """Sizes and times of all files that a run reads and writes: while these are the same, nothing is left to do."""
+def _state(recipe: Recipe, scene: Path, results: Path) -> str:
+    """Key of sizes and times of all files that a run reads and writes: while it is the same, nothing is left to do."""
     recipe, scene, results = recipe.located(Path.resolve), scene.resolve(), results.resolve()
     given = *recipe.sources, recipe.picks, recipe.matrix, recipe.positions
     roots = [path for path in (*given, scene, results) if path]
     found = [path for root in roots for path in (sorted(root.rglob("*")) if root.is_dir() else [root])]
     files = [path for path in found if path.is_file() and results / "steps" not in path.parents]
     stats = [(str(path), stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]]
-    return [str(recipe), metadata.version("shellgs"), stats]
+    return fingerprint(str(recipe), metadata.version("shellgs"), stats)
 
 
-def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: bool) -> Path:
+def _take_all_steps(recipe: Recipe, scene: Path, results: Path, accept: bool, done: Record) -> Path:
     """Take all steps that are not done, and return the config of what was trained."""
-    video, *shell = recipe.sources
-    steps.begin("cameras of the photographs")
-    place, beside = str(video.resolve()), os.path.relpath(video.resolve(), scene.resolve())
-    # Where a project was copied to, its photographs are beside it as before.
-    of_another = "capture" in steps and steps.changed("capture", place) and steps.changed("capture beside", beside)
-    if of_another or not any(cameras.exists() for cameras in _cameras(scene)):
-        capture(video, scene)
-        steps.done("capture", place)
-        steps.done("capture beside", beside)
-    else:  # captured with options of its own, perhaps
-        console.print(f"{scene} has cameras.")
-    steps.begin("the shell's place")
-    _align(recipe, scene, tuple(shell), steps, accept)
-    steps.begin("the shell in the photographs")
+    numbers = count(1)
+
+    def begin(what: str) -> None:
+        console.rule(f"{next(numbers)} of {5 + recipe.sim}: {what}", align="left")
+
+    def make(product: Path, step: str, command: Callable[[], object]) -> None:
+        """Make a product of the trained run, unless it is there."""
+        if not done.has(step, checkpoint) or not product.exists():
+            command()
+            done.note(step, checkpoint)
+
+    begin("cameras of the photographs")
+    _capture(recipe, scene, done)
+    begin("the shell's place")
+    _align(recipe, scene, accept, done)
+    begin("the shell in the photographs")
     cast(scene, max_image_size=recipe.max_image_size)
-    steps.begin("training and evaluation")
-    trained = _train(recipe, scene, results, steps)
-    steps.begin("mesh")
-    checkpoint = trained.key, *(path.name for path in trained.folder.glob("nerfstudio_models/*.ckpt"))
-    if steps.changed("mesh", *checkpoint) or not (results / "mesh.ply").exists():
-        mesh(trained.config, results / "mesh.ply")
-        steps.done("mesh", *checkpoint)
-    if steps.changed("page", *checkpoint) or not trained.page.exists():
-        from shellgs_method.compare.results import write_results
-
-        splats(trained.config, trained.page)
-        write_results([trained], results, {})  # whose report now has a link to it
-        steps.done("page", *checkpoint)
+    begin("training and evaluation")
+    trained = _train(recipe, scene, results, done)
+    checkpoint = fingerprint(trained.key, *(path.name for path in trained.folder.glob("nerfstudio_models/*.ckpt")))
+    begin("mesh")
+    make(results / "mesh.ply", "mesh", lambda: mesh(trained.config, results / "mesh.ply"))
+    make(trained.page, "page", lambda: _write_page(trained, results))
     if recipe.sim:
-        steps.begin("folder for simulators")
-        if steps.changed("sim", *checkpoint) or not (results / "sim").exists():
-            simulate((trained.config, results / "sim"))
-            steps.done("sim", *checkpoint)
+        begin("folder for simulators")
+        make(results / "sim", "sim", lambda: simulate((trained.config, results / "sim")))
     return trained.config
-
-
-class _Steps:
-    """Which steps are done, with what: kept in a file, so that a run goes on.
-
-    Args:
-        folder: folder of the file, locked by the run.
-        total: number of steps.
-    """
-
-    def __init__(self, folder: Path, total: int) -> None:
-        self.folder, self._path, self._total, self._begun = folder, folder / "done.json", total, 0
-        folder.mkdir(parents=True, exist_ok=True)
-        self._done = read_json(self._path) if self._path.is_file() else {}
-
-    def begin(self, what: str) -> None:
-        """Show which step begins."""
-        self._begun += 1
-        console.rule(f"{self._begun} of {self._total}: {what}", align="left")
-
-    def __contains__(self, step: str) -> bool:
-        """Whether a step was done."""
-        return step in self._done
-
-    def changed(self, step: str, *inputs: object) -> bool:
-        """Whether a step was not done with these inputs."""
-        return self._done.get(step) != fingerprint(*inputs)
-
-    def forget(self, step: str) -> None:
-        """Let a step be done again."""
-        self._done.pop(step, None)
-
-    def done(self, step: str, *inputs: object) -> None:
-        """Note that it was."""
-        self._done[step] = fingerprint(*inputs)
-        write_whole(self._path, json.dumps(self._done, indent=1))
 
 
 def _settled(recipe: Recipe, file: Path) -> Recipe:
@@ -306,7 +265,22 @@ def _settled(recipe: Recipe, file: Path) -> Recipe:
     return stored
 
 
-def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, accept: bool) -> None:
+def _capture(recipe: Recipe, scene: Path, done: Record) -> None:
+    """Find the cameras, unless there are some of these photographs."""
+    video = recipe.sources[0]
+    place = fingerprint(str(video.resolve()))
+    beside = fingerprint(os.path.relpath(video.resolve(), scene.resolve()))
+    # Where a project was copied to, its photographs are beside it as before.
+    of_another = "capture" in done and not (done.has("capture", place) or done.has("capture beside", beside))
+    if of_another or not any(cameras.exists() for cameras in _cameras(scene)):
+        capture(video, scene)
+        done.note("capture", place)
+        done.note("capture beside", beside)
+    else:  # captured with options of its own, perhaps
+        console.print(f"{scene} has cameras.")
+
+
+def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     """Align the shell if that was not done with these settings, and stop where a person must look at it.
 
     Raises:
@@ -316,19 +290,20 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     from shellgs_method.registration.validation import LIKELIER
     from shellgs_method.shell import Alignment
 
+    shell = recipe.sources[1:]
     files = *shell, recipe.matrix, recipe.picks, recipe.positions, *_cameras(scene)
     hashes = [path and path.exists() and content_hash(path) for path in files]
     settings = recipe.refine, recipe.metres_per_shell_unit, recipe.crs, recipe.bundle_adjust, recipe.same_frame
-    inputs, report = (*hashes, *settings), scene / REPORT / "index.html"
+    key, report = fingerprint(*hashes, *settings), scene / REPORT / "index.html"
     proposed, named = not recipe.starts, shlex.quote(str(scene))
-    accepted = not steps.changed("accepted", *inputs)
+    accepted = done.has("accepted", key)
     written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
     refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
     words = *map(str, shell), *shell_words(recipe.metres_per_shell_unit, recipe.crs)
     pick = f"shellgs pick {named} {shlex.join(words)}"
     remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and have --picks picks.txt"
     try:
-        if steps.changed("align", *inputs) or not _is_there(written, scene):
+        if not done.has("align", key) or not _is_there(written, scene):
             align(
                 scene,
                 shell,
@@ -339,9 +314,9 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
                 crs=recipe.crs,
             )
             if proposed:  # it is seen first
-                steps.forget("accepted")
+                done.forget("accepted")
                 accept = accepted = False
-            steps.done("align", *inputs)
+            done.note("align", key)
         elif accept and proposed and not accepted:
             align(scene, accept=True, bundle_adjust=recipe.bundle_adjust)
     except SceneError as error:
@@ -349,7 +324,7 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
             open_page(report)
         raise SceneError(f"{error}; {remedy} in {scene}.run") from error
     if accept:
-        steps.done("accepted", *inputs)
+        done.note("accepted", key)
     if accept or accepted:
         return
     aligned = Alignment.load(scene / (PROPOSAL if proposed else ALIGNMENT))
@@ -371,7 +346,7 @@ def _is_there(alignment: Path, scene: Path) -> bool:
     return alignment.is_file() and all(path.is_file() for path in Alignment.load(alignment).files(scene))
 
 
-def _train(recipe: Recipe, scene: Path, results: Path, steps: _Steps) -> Run:
+def _train(recipe: Recipe, scene: Path, results: Path, done: Record) -> Run:
     """Train and evaluate, unless that is done; an interrupted run goes on, one with other settings is put aside."""
     import nerfstudio.configs.method_configs  # noqa: F401  (first: its import takes longer from deep in others)
 
@@ -389,10 +364,18 @@ def _train(recipe: Recipe, scene: Path, results: Path, steps: _Steps) -> Run:
     except DamagedRunError:  # which is told below
         pass
     truth = scene / "cues/truth/manifest.json"
-    measured_by = content_hash(truth) if truth.is_file() else ""
-    if steps.changed("evaluation", measured_by):
+    measured_by = fingerprint(content_hash(truth) if truth.is_file() else "")
+    if not done.has("evaluation", measured_by):
         trained.metrics().unlink(missing_ok=True)
     if compare(runs, partial(launch_locally, jobs=1, console=console), results, console).failures:
         raise SystemExit("shellgs: the training failed; the end of its output is above. The same command goes on.")
-    steps.done("evaluation", measured_by)
+    done.note("evaluation", measured_by)
     return trained
+
+
+def _write_page(trained: Run, results: Path) -> None:
+    """Write the page to walk around on, and the report, which now has a link to it."""
+    from shellgs_method.compare.results import write_results
+
+    splats(trained.config, trained.page)
+    write_results([trained], results, {})
