@@ -11,12 +11,10 @@ import zlib  # noqa: F401  isort: skip
 import json
 import os
 import shutil
-import sqlite3
 import sys
 import threading
 from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import closing
 from functools import cache, partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -25,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from database import copied  # pyright: ignore[reportMissingImports]  isort: skip
 from loops import CONFIRMED, DRIFT, View, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
 from zoom import zoomed  # pyright: ignore[reportMissingImports]  isort: skip
 
@@ -422,9 +421,7 @@ def _calibrated(database: str, folder: str) -> str:
 
     View graph calibration (Sweeney et al. 2015); where pairs do not determine it, the guess stays.
     """
-    copy = f"{folder}/calibrated.db"
-    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
-        source.backup(target)
+    copy = str(copied(Path(database), Path(folder) / "calibrated.db"))
     pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=SEED))
     return copy
 

@@ -6,21 +6,18 @@ import errno
 import json
 import os
 import shutil
-import sqlite3
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
+from shellgs_method.capture.config import LEAST_REGISTERED, CaptureConfig
+from shellgs_method.capture.database import NO_PARALLAX, copied, counting, flat_pairs, tidy
 from shellgs_method.capture.loops import along_the_walk
 from shellgs_method.capture.pairs import Pair, choose_matching, image_pairs
 from shellgs_method.capture.panoramas import (
@@ -52,6 +49,7 @@ from shellgs_method.capture.photographs import (
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
+from shellgs_method.capture.verdict import Summary, judged
 from shellgs_method.capture.work import Work, listing, refuse_foreign
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
@@ -59,43 +57,10 @@ from shellgs_method.files.locks import alone_in
 from shellgs_method.files.paths import PHOTOGRAPHS, RAW
 from shellgs_method.files.scene import CAPTURE
 
-SUSPICIOUS_ERROR = 1.0
-"""Mean reprojection error in pixels: right models of real and synthetic facades had 0.4 to 0.8. Folded ones may have no
-more, and are told by what neighbours have in common."""
-
-LEAST_SEEN = 30
-"""Points that a photograph shows in the mean: COLMAP places none by fewer. Of 960 x 540 pixels they are 750."""
-
-_HOMOGRAPHIES = (4, 5, 6)  # COLMAP's PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
-_MATCHED = 100  # features, of a pair that shows the same: of others they were 31 at most
-_NO_PARALLAX = 0.95  # share of such pairs: all of a camera on a tripod, a sixth of a walk along the synthetic facade
-
-_OFF_EXIF = 1.2  # factor; EXIF's, of the diagonal or the width and rounded, was up to 10 % off that of right models
-_OFF_SQUARE = 1.03  # factor; of right models two focal lengths differed by 0.5 % at most
-
 _SIFT = {
     "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
     "high": {"max_image_size": 3200, "max_num_features": 8192, "first_octave": -1},
 }
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Result of structure from motion.
-
-    Attributes:
-        registered: photographs with a camera.
-        missing: photographs without a camera.
-        points: number of 3D points.
-        reprojection_error: mean reprojection error in pixels.
-        track_length: mean number of photographs that observe a point.
-    """
-
-    registered: list[str]
-    missing: list[str]
-    points: int
-    reprojection_error: float
-    track_length: float
 
 
 def capture(
@@ -158,6 +123,7 @@ class _Capture:
         # Photographs with transparent pixels have a mask without a file.
         self.transparent = [] if self.is_video else [n for n, path in self.photographs.items() if has_alpha(path)]
         self.masked = [name for name in self.photographs if name in self.masks or name in self.transparent]
+        self.mask_folder = scene / CAPTURE / "masks" if self.masked else None
         # Keys of all that each stage depends on; a stage depends on all earlier ones.
         frames = config.frames if self.is_video else None
         self.photographs_key = fingerprint(listing(self.photographs), frames, config.camera_type)
@@ -174,7 +140,8 @@ class _Capture:
                 self._photographs()
                 database = self._features()
                 self._model(database)
-            summary = self._largest_model(read_json(self.work.folder / "model" / "models.json"))
+            found = read_json(self.work.folder / "model" / "models.json")
+            summary = judged(found, self.source, self.config, self.mask_folder)
             self._undistorted(summary)
         return summary
 
@@ -217,17 +184,6 @@ class _Capture:
                     if not is_whole:
                         add_mask_faces(target, folder, name, self.folder)
 
-    def _said_of_masks(self) -> str:
-        """How much the masks leave of some photographs, for where it was too little; empty without masks."""
-        files = sorted((self.work.folder / "masks").rglob("*.png")) if self.masked else []
-        shares = []
-        for path in files[:: max(1, len(files) // 6)]:
-            with Image.open(path) as mask:
-                shares.append(float(np.mean(np.asarray(mask.convert("L")) > 0)))
-        return (
-            f". The masks keep {np.mean(shares):.0%} of the pixels: white is kept, black is ignored" if shares else ""
-        )
-
     def _said_to_be_panoramas(self) -> set[str]:
         """Names of the sources that are panoramas, by the user's word or by their metadata."""
         if self.config.camera_type != "auto":
@@ -269,7 +225,7 @@ class _Capture:
             tell_of_near_copies(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
-        with _counting(database) as rows:
+        with counting(database) as rows:
             self._step(
                 "extract",
                 "finding features",
@@ -279,12 +235,12 @@ class _Capture:
                 photographs=self.folder,
                 lenses=[asdict(lens) for lens in lenses],
                 rigs=[face_rig()] if faces else [],
-                masks=self.work.folder / "masks" if self.masked else None,
+                masks=self.mask_folder,
                 sift=_SIFT[self.config.quality],
                 contrasts={name: contrast(self.folder / name) for name in self.names},
                 camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
             )
-        _tidy(database)
+        tidy(database)
         return database
 
     def _model(self, database: Path) -> None:
@@ -315,7 +271,7 @@ class _Capture:
                 lens["names"].sort(key=along_the_walk)
                 lens["exif"] = focal_length_of_exif(self.folder / lens["names"][0])
             found = {"photographs": self.names, "models": models, "apart": apart, "matching": matching}
-            found["flat_pairs"] = _flat_pairs(database)
+            found["flat_pairs"] = flat_pairs(database)
             (folder / "models.json").write_text(json.dumps(found))
 
     def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Any], list[Any] | None]:
@@ -364,13 +320,13 @@ class _Capture:
         return self._step("follow", "following the walk", database=database, passes=order)
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
-        with _counting(database) as rows:
+        with counting(database) as rows:
             done = partial(rows, "two_view_geometries")
             self._step("match", description, len(pairs), done, database=database, pairs=pairs)
 
     def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
         where: dict[str, Any] = {"database": database, "photographs": self.folder, "output": folder}
-        has_parallax = _flat_pairs(database) <= _NO_PARALLAX
+        has_parallax = flat_pairs(database) <= NO_PARALLAX
         return self._step("reconstruct", description, len(self.names), **where, has_parallax=has_parallax)
 
     def _mounted(self, database: Path, folder: Path) -> list[dict[str, Any]]:
@@ -379,10 +335,8 @@ class _Capture:
         Raises:
             SceneError: the cameras are not mounted together.
         """
-        with self.work.making("rig", self.model_key) as copied:
-            copy = copied / database.name  # a resumed capture begins without the rig
-            with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
-                source.backup(target)
+        with self.work.making("rig", self.model_key) as made:
+            copy = copied(database, made / database.name)  # a resumed capture begins without the rig
             where: dict[str, Any] = {"database": copy, "photographs": self.folder, "model": folder}
             found = self._step("mount", "finding the rig", len(self.names), prefixes=self.rig, **where)
         self.work.clear("rig")
@@ -394,94 +348,6 @@ class _Capture:
                 f"were not taken at once: against each other, they are {how}. Try --cameras folder"
             )
         return found["models"]
-
-    def _largest_model(self, found: dict[str, Any]) -> Summary:
-        """Summary of the largest model, of which what makes it doubtful is told.
-
-        Raises:
-            SceneError: it has too few of the photographs, or they show too few points.
-        """
-        names, models = found["photographs"], found["models"]
-        largest: dict[str, Any] = models[0] if models else {"names": []}
-        missing = sorted(set(names) - set(largest["names"]), key=along_the_walk)
-        self._refuse_little(found, largest, missing)
-        self._tell_of_doubts(largest)
-        for model in models[1:]:
-            if len(model["names"]) >= LEAST_REGISTERED:
-                only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
-                self._tell_of_a_pass_apart(only, found.get("apart", []))
-        kept = ("points", "reprojection_error", "track_length")
-        return Summary(largest["names"], missing, **{name: largest[name] for name in kept})
-
-    def _refuse_little(self, found: dict[str, Any], largest: dict[str, Any], missing: list[str]) -> None:
-        """Refuse a model of too few of the photographs, or of too few points; tell of photographs without parallax."""
-        names, models, registered = found["photographs"], found["models"], len(largest["names"])
-        is_flat = found.get("flat_pairs", 0) > _NO_PARALLAX
-        points, seen_in = largest.get("points", 0), largest.get("track_length", 0.0)
-        sees_little = points * seen_in < LEAST_SEEN * registered
-        if is_flat and (sees_little or registered < LEAST_SHARE * len(names)):
-            raise SceneError(
-                f"the photographs of {self.source} show no parallax: almost any two differ by a turn of the camera "
-                f"alone, or show one plane, and the cameras of {registered} of {len(names)} were found, by {points} "
-                "points. Walk sideways along the building, a step between photographs; neither stand nor turn on the "
-                "spot"
-            )
-        if is_flat:
-            notice(
-                f"The photographs of {self.source} show hardly any parallax: was the camera turned on the spot, or is "
-                "all it saw one plane? Look at the cameras' path before you go on."
-            )
-        if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
-            groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
-            shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-            untried = ["--matching exhaustive"] if found.get("matching") == "sequential" else []
-            untried += ["--quality high"] if self.config.quality == "fast" else []
-            untried += ["more --frames"] if self.is_video else []
-            advice = f"Try {' and '.join(untried)}; leave" if untried else "Leave"
-            raise SceneError(
-                f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
-                f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. {advice} out "
-                f"photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
-                f"{self._said_of_masks()}"
-            )
-        if sees_little:
-            raise SceneError(
-                f"the photographs of {self.source} show too little to find cameras by: only {points} points, each in "
-                f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, "
-                f"which show at least {LEAST_SEEN} points each{self._said_of_masks()}"
-            )
-
-    def _tell_of_doubts(self, largest: dict[str, Any]) -> None:
-        """Tell of a model that is torn, or whose focal length changes or is not that of its lens."""
-        if torn := largest.get("torn"):
-            slower = "more --frames, or a slower walk, help" if self.is_video else "more photographs there help"
-            notice(
-                f"The cameras found for {self.source} contradict nearly all that {' and '.join(torn)} and their "
-                f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
-                f"{slower}."
-            )
-        if zoomed := largest.get("zoomed"):
-            change, short, long, behind = zoomed
-            step = f" (in a step: {behind} is the first behind it)" if behind else ""
-            notice(
-                f"The focal length of {self.source} seems to change by {change:.0%}, between {short} and {long} for "
-                f"example{step}, where one camera is taken for all: by zooming, another lens, cropping, as "
-                "stabilisation does, or the distortion of a fisheye lens. Cameras may be metres off. Record without "
-                "these; photographs of two lenses go into a folder each, with --cameras folder."
-            )
-        else:
-            for lens in largest.get("lenses", []):
-                _tell_of_a_doubtful_lens(**lens)
-
-    def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
-        if not names:
-            return
-        because = next((each["fault"] for each in faults if set(names) & set(each["names"])), "too little overlap")
-        notice(
-            f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, did not join the others, "
-            f"{because}: "
-            "take some on the way from one pass to the other, in small steps, and with a corner of the building in view"
-        )
 
     def _missing_parts(self) -> list[str]:
         """Parts of the scene that are neither in place nor ready to be moved there."""
@@ -507,7 +373,7 @@ class _Capture:
                 lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
                 model=self.work.folder / "model",
                 photographs=self.folder,
-                masks=self.work.folder / "masks" if self.masked else None,
+                masks=self.mask_folder,
                 output=folder,
             )
             for name in _files(folder / "images"):
@@ -531,60 +397,7 @@ class _Capture:
         return run_step(step, arguments, log=self.work.folder / "colmap.log", **shown)
 
 
-def _tell_of_a_doubtful_lens(names: list[str], focal: Sequence[float], exif: float | None) -> None:
-    """Tell of a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
-    across, down = focal
-    is_other = exif is not None and not 1 / _OFF_EXIF < (across + down) / 2 / exif < _OFF_EXIF
-    if is_other or max(across, down) > _OFF_SQUARE * min(across, down):
-        said = f", in EXIF {exif:.0f}" if exif else ""
-        notice(
-            f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} "
-            f"pixels across and {down:.0f} down were found{said}. If they were not cropped, stretched or "
-            "stabilised, they do not tell it, as where all look straight at one plane, or ahead along a street, "
-            "and depths are off by as much: take some from the side, at angles to the wall."
-        )
-
-
 def _files(folder: Path) -> list[str]:
     """Names of the files in a folder and below, along the walk."""
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(names, key=along_the_walk)
-
-
-@contextmanager
-def _counting(database: Path) -> Iterator[Callable[[str], int]]:
-    """What counts the rows of a table, with a condition perhaps, that another process may be writing.
-
-    It keeps one connection: where one ends, SQLite locks the database for a moment, and COLMAP cannot open it.
-    """
-    kept: list[sqlite3.Connection] = []
-
-    def count(table: str) -> int:
-        with suppress(sqlite3.Error):  # does not exist yet, or is busy
-            if not kept:
-                kept.append(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True))
-            return kept[0].execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-        return 0
-
-    try:
-        yield count
-    finally:
-        for connection in kept:
-            connection.close()
-
-
-def _flat_pairs(database: Path) -> float:
-    """Share of the pairs that a homography explains: of a turning camera, of a plane, or of a camera that stood."""
-    # COLMAP leaves out all matches of what stands at the same pixels.
-    pairs = "matches JOIN two_view_geometries AS kept USING (pair_id)"
-    with _counting(database) as rows:
-        counts = {kind: rows(f"two_view_geometries WHERE rows > 0 AND config = {kind}") for kind in range(2, 9)}
-        stood = rows(f"{pairs} WHERE matches.rows >= {_MATCHED} AND kept.rows = 0")
-    return (stood + sum(counts[kind] for kind in _HOMOGRAPHIES)) / max(1, stood + sum(counts.values()))
-
-
-def _tidy(database: Path) -> None:
-    """Let SQLite remove the files that it made beside a database when :func:`_counting`, which may not, came last."""
-    writing = f"{database.absolute().as_uri()}?mode=rw"
-    with suppress(sqlite3.Error), closing(sqlite3.connect(writing, uri=True)) as connection:
-        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
+from shellgs_method.capture.database import counting, tidy
 from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
 from shellgs_method.capture.loops import CONFIRMED
 from shellgs_method.capture.pairs import choose_matching, image_pairs
@@ -1030,17 +1031,17 @@ def test_counting_rows_leaves_no_files_beside_the_database(tmp_path):
     database = tmp_path / "database.db"
     with closing(sqlite3.connect(database)) as connection:
         connection.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id); INSERT INTO cameras VALUES (1)")
-    with stages._counting(database) as rows:
+    with counting(database) as rows:
         assert rows("cameras") == 1
-    stages._tidy(database)
+    tidy(database)
     assert list(tmp_path.iterdir()) == [database]
 
 
 def test_rows_that_are_being_written_are_counted_over_one_connection(tmp_path, monkeypatch):
     """Each that ends locks the database for a moment, in which COLMAP fails to open it."""
     database, opened, connect = tmp_path / "database.db", [], sqlite3.connect
-    monkeypatch.setattr(stages.sqlite3, "connect", lambda *a, **k: opened.append(connect(*a, **k)) or opened[-1])
-    with stages._counting(database) as rows:
+    monkeypatch.setattr(sqlite3, "connect", lambda *a, **k: opened.append(connect(*a, **k)) or opened[-1])
+    with counting(database) as rows:
         assert rows("cameras") == 0  # it does not exist yet
         with closing(connect(database)) as writing:
             writing.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id)")
