@@ -19,7 +19,7 @@ from PIL import Image
 from rich.progress import Progress
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from shellgs_method.capture.photographs import show_the_same
+from shellgs_method.capture.sources import show_the_same
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.transfer import HDR, Transfer, narrowed, tone_mapped
 

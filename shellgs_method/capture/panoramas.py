@@ -22,7 +22,7 @@ from jaxtyping import Float32, Float64, Shaped
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.capture.photographs import Lens
+from shellgs_method.capture.lenses import Lens
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.exif import exif_of, tags_of
 

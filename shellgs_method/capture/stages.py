@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from shellgs_method.capture.config import LEAST_REGISTERED, CaptureConfig
 from shellgs_method.capture.database import NO_PARALLAX, copied, counting, flat_pairs, tidy
+from shellgs_method.capture.lenses import focal_length_of_exif, group_by_lens, tell_of_unknown_lenses
 from shellgs_method.capture.loops import along_the_walk
 from shellgs_method.capture.pairs import Pair, choose_matching, image_pairs
 from shellgs_method.capture.panoramas import (
@@ -38,17 +39,12 @@ from shellgs_method.capture.photographs import (
     add_photograph,
     contrast,
     find_masks,
-    find_photographs,
-    focal_length_of_exif,
-    group_by_lens,
     keep_exposure,
     masks_as_stored,
-    tell_of_another_order,
-    tell_of_near_copies,
-    tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
+from shellgs_method.capture.sources import find_photographs, tell_of_another_order, tell_of_near_copies
 from shellgs_method.capture.verdict import Summary, judged
 from shellgs_method.capture.work import Work, listing, refuse_foreign
 from shellgs_method.errors import SceneError, notice

@@ -31,6 +31,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.database import counting, tidy
 from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
+from shellgs_method.capture.lenses import group_by_lens, tell_of_unknown_lenses
 from shellgs_method.capture.loops import CONFIRMED
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
@@ -38,15 +39,11 @@ from shellgs_method.capture.photographs import (
     add_photograph,
     contrast,
     find_masks,
-    find_photographs,
-    group_by_lens,
     keep_exposure,
     masks_as_stored,
-    tell_of_another_order,
-    tell_of_near_copies,
-    tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
+from shellgs_method.capture.sources import find_photographs, tell_of_another_order, tell_of_near_copies
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
 from shellgs_method.files.locks import held

@@ -10,7 +10,8 @@ from PIL import ExifTags, Image, ImageOps
 from scenes import photograph
 
 from dataparsers.orientation import _orientation
-from shellgs_method.capture.photographs import add_mask, add_photograph, group_by_lens, keep_exposure
+from shellgs_method.capture.lenses import group_by_lens
+from shellgs_method.capture.photographs import add_mask, add_photograph, keep_exposure
 from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.photographs import exif_log_gains, opened, read_image, read_mask
 

@@ -21,7 +21,7 @@ from scenes import cast, write_colmap
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.capture.photographs import find_photographs
+from shellgs_method.capture.sources import find_photographs
 from shellgs_method.commands import cast as casting
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun

@@ -1,0 +1,217 @@
+"""The photographs in a folder: which there are, copies among them, and whether names follow the walk."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from PIL import ExifTags, Image, ImageOps
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.exif import orientation_of, tags_of
+from shellgs_method.files.paths import (
+    DEVELOP,
+    PHOTOGRAPHS,
+    RAW,
+    captured_name,
+    copies_among,
+    files_below,
+    is_hidden,
+    photographs_in,
+)
+
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
+"""Suffixes of videos, in lower case."""
+_PLACEHOLDER = ".icloud"  # of a hidden file in the place of one that macOS keeps elsewhere: .IMG_0001.HEIC.icloud
+_MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal, ExifTags.Base.Make, ExifTags.Base.Model)
+_IN_ORDER = 0.5  # of the steps from one name to the next, that are between neighbours by time
+# Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
+# at most, at a tenth of the light, others 0.28 and more.
+_SMALL, _ALIKE = 32, 0.15
+_SAME = 0.3  # pixels by which pictures may seem moved that show the same: those encoded again by 0.04, others by 0.9
+
+
+def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]:
+    """The photographs in a folder and its sub-folders, by their names in the scene; other files and copies are told.
+
+    Args:
+        folder: the folder.
+        masks: folder of masks, which may be one of the sub-folders.
+
+    Raises:
+        SceneError: there are none, some are raw without a developed one beside, two would get the same name, or masks
+            lie among them.
+    """
+    photographs = photographs_in(folder, deep=True)
+    if masks:
+        among = masks.resolve()
+        if folder.resolve() == among:
+            raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
+        if not folder.resolve().is_relative_to(among):
+            photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
+    found: dict[str, Path] = {}
+    _tell_what_is_left_out(folder, photographs)
+    for path in _without_copies(folder, photographs):
+        name = captured_name(path.relative_to(folder))
+        if name in found:
+            raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
+        found[name] = path
+    return found
+
+
+def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
+    """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
+    files = [
+        path
+        for path in sorted(files_below(folder))
+        if not is_hidden((path.parent if path.suffix == _PLACEHOLDER else path).relative_to(folder)) and path.is_file()
+    ]
+    developed = {path.with_suffix("") for path in photographs}
+    raw = [path for path in files if path.suffix.lower() in RAW and path.with_suffix("") not in developed]
+    if raw:
+        raise SceneError(f"{len(raw)} files of {folder} are raw photographs, {raw[0].name} for example: {DEVELOP}")
+    others = Counter(path.suffix.lower() or path.name for path in files if path.suffix.lower() not in PHOTOGRAPHS)
+    said = {_PLACEHOLDER: " that iCloud has not downloaded yet"}
+    counted = ", ".join(f"{count} {suffix}{said.get(suffix, '')}" for suffix, count in sorted(others.items()))
+    if not photographs:
+        videos = "; of videos, give one file" if VIDEOS & others.keys() else ""
+        there = f", but {counted}" if counted else ""
+        raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
+    if counted:
+        notice(f"{others.total()} files of {folder} are no photographs, and are left out ({counted}).")
+
+
+def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
+    """Photographs without those that are copies of another's file, which is told, as are two formats of one name.
+
+    A view would be trained on whose copy is held out.
+    """
+    copies = copies_among(photographs)
+    copies |= _smaller_copies([path for path in photographs if path not in copies])
+    if copies:
+        copy, original = min(copies.items())
+        notice(
+            f"{len(copies)} photographs of {folder} are copies of others, and are left out "
+            f"({copy.relative_to(folder)} is {original.relative_to(folder)}, for example)."
+        )
+    kept = [path for path in photographs if path not in copies]
+    stems = Counter(path.with_suffix("") for path in kept)
+    if twins := [path.name for path in kept if stems[path.with_suffix("")] > 1]:
+        notice(
+            f"{len(twins)} photographs of {folder} differ from another's name in their suffix alone ({twins[0]} and "
+            f"{twins[1]}, for example): if they are one photograph in two formats, move one of the two away, or "
+            "metrics of held-out photographs are too good."
+        )
+    _tell_of_versions(folder, [path for path in kept if stems[path.with_suffix("")] == 1])
+    return kept
+
+
+def _smaller_copies(photographs: Sequence[Path]) -> dict[Path, Path]:
+    """Photographs that are scaled down from another of the same name, as nerfstudio's images_2 are, and that one."""
+    named: dict[str, list[Path]] = {}
+    for path in photographs:
+        named.setdefault(path.stem, []).append(path)
+    copies: dict[Path, Path] = {}
+    for paths in (paths for paths in named.values() if len(paths) > 1):
+        sizes = {path: _size(path) for path in paths}
+        largest = max(paths, key=lambda path: sizes[path])
+        width, height = sizes[largest]
+        for path, (across, down) in sizes.items():
+            if across < width and abs(across * height - down * width) <= max(width, height):
+                with suppress(Exception):  # whatever a damaged one leads to, which is told where it is read
+                    whole = _small(largest)
+                    if np.abs(_small(path) - whole).mean() < _ALIKE * whole.std():
+                        copies[path] = largest
+    return copies
+
+
+def _size(photograph: Path) -> tuple[int, int]:
+    """Width and height as a photograph is shown; 0 where it cannot be read, which is told where it is."""
+    with suppress(Exception), Image.open(photograph) as image:
+        return image.size[::-1] if orientation_of(image) > 4 else image.size
+    return 0, 0
+
+
+def _small(photograph: Path) -> Float32[np.ndarray, "H W"]:
+    with Image.open(photograph) as image:
+        image.draft("L", (8 * _SMALL, 8 * _SMALL))
+        upright = ImageOps.exif_transpose(image).convert("L")
+        return np.asarray(upright.resize((_SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+
+
+def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
+    """Tell the user of photographs of one moment, as of one and what an editor made of it (IMG_0001, IMG_E0001)."""
+    moments: dict[tuple, list[Path]] = {}
+    for path in photographs:
+        with suppress(Exception), Image.open(path) as image:
+            when, fraction, *camera = _moment(tags_of(image))
+            if when and fraction.strip("0"):  # many cameras write no fraction of a second, or 00
+                moments.setdefault((path.parent, when, fraction, *camera), []).append(path)
+    if versions := [paths for paths in moments.values() if len(paths) > 1]:
+        first, second = sorted(versions[0])[:2]
+        count = sum(map(len, versions)) - len(versions)
+        notice(
+            f"{count} photographs of {folder} were taken at the very moment of others "
+            f"({second.name} at that of {first.name}, for example): if they are edited versions, move one of the two "
+            "away, or metrics of held-out photographs are too good."
+        )
+
+
+def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "*N"]:
+    """Whether small grey pictures differ from one by less than if it moved a little, aside or up and down.
+
+    Less than its contrast would not do: of a plain wall between bright sky and dark ground, all have the same.
+    """
+    moved = min(np.abs(np.diff(after, axis=axis)).mean() for axis in (0, 1))
+    return np.abs(after - before).mean((-2, -1)) < _SAME * moved
+
+
+def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
+    """Tell the user of photographs that show the same as others, as those that a messenger encoded again."""
+    small = np.stack([_small(folder / name) for name in names])
+    copies = [
+        (name, names[int(alike.argmax())])
+        for k, name in enumerate(names)
+        if (alike := show_the_same(small[:k], small[k])).any()
+    ]
+    if copies:
+        notice(
+            f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, for "
+            "example): of copies, move one of the two away, or metrics of held-out photographs are too good."
+        )
+
+
+def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> None:
+    """Tell the user of photographs that were taken in another order than that of their names, by EXIF.
+
+    Args:
+        folder: folder of the photographs.
+        names: their names, in the order in which neighbours are matched.
+        overlap: how many after each of them are.
+    """
+    walks: dict[tuple, list[tuple[str, str]]] = {}  # times, of each folder and camera
+    for name in names:
+        with Image.open(folder / name) as image:
+            when, fraction, *camera = _moment(tags_of(image))
+        if when:
+            walks.setdefault((name.rpartition("/")[0], *camera), []).append((when, fraction))
+    places = [np.argsort(sorted(range(len(walk)), key=walk.__getitem__)) for walk in walks.values()]
+    # From name to name, not from time to time: two phones of one kind take turns, and are each in order.
+    steps = [abs(a - b) for place in places for a, b in pairwise(place)]
+    if sum(step <= overlap for step in steps) < _IN_ORDER * len(steps):
+        notice(
+            f"The names of the photographs, {names[0]} for example, do not follow the order in which they were taken, "
+            "by EXIF, but are what neighbours are looked for by: cameras may be metres off. Rename them by time, or "
+            "use --matching exhaustive."
+        )
+
+
+def _moment(tags: Mapping[int, Any]) -> tuple[str, ...]:
+    """When a photograph was taken, to which fraction of a second, and by which camera, as EXIF data say."""
+    return tuple(str(tags.get(tag, "")).strip() for tag in _MOMENT)
