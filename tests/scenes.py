@@ -18,6 +18,9 @@ from shellgs_method.files.photographs import View
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.shell.cast import CastSummary
 
+PHONE = Path(__file__).with_name("phone.heic")
+"""48 x 32 pixels, red in the upper left corner."""
+
 
 def parse(scene: Path, split: str = "train", **config) -> DataparserOutputs:
     return FacadeDataParserConfig(data=scene, **config).setup().get_dataparser_outputs(split)
@@ -48,6 +51,11 @@ def photograph(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
     pixels = gaussian_filter(noise, (1, 1, 0)).astype(np.uint8)
     pixels[: height // 4, : width // 4] = (255, 0, 0)
     return Image.fromarray(pixels)
+
+
+def is_red(image: Image.Image, x: int, y: int) -> bool:
+    red, green, blue = image.convert("RGB").getpixel((x, y))  # pyright: ignore[reportGeneralTypeIssues]
+    return red > 200 and green < 80 and blue < 80
 
 
 def write_video(path: Path, frames: list[Image.Image], rate: int = 10, pixel_aspect: Fraction = Fraction(1)) -> None:

@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import parse, write_colmap
+from scenes import PHONE, parse, write_colmap
 
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -680,7 +680,7 @@ def test_a_square_photograph_is_turned_for_an_upright_camera(scene):
 
 def test_photographs_of_a_phone_are_read(scene):
     (scene / "images" / "frame_00002.png").unlink()
-    shutil.copy(Path(__file__).parents[1] / "phone.heic", scene / "images" / "frame_00002.HEIC")
+    shutil.copy(PHONE, scene / "images" / "frame_00002.HEIC")
     respell(scene, lambda path: path.replace("00002.png", "00002.HEIC"))
     assert (load_photograph(parse(scene).metadata["views"][0])[4, 4] > [200, -1, -1]).all()
 
