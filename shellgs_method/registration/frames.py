@@ -15,7 +15,7 @@ from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, REMEDY, Step, cloud_step, mesh_step
 from shellgs_method.geometry.triangles import area_vectors, sampled
-from shellgs_method.registration.sfm_frame import first_slip, in_degrees
+from shellgs_method.registration.slips import first_slip, in_degrees
 
 _SAMPLES = 100_000
 # Distances from the shell, relative to its size:

@@ -1,51 +1,26 @@
-"""Whether points lie in the frame of something else, and which slip explains it if they do not.
-
-Files are exported with other axes, in other units, or without a shift. Each of these is one of the :func:`slips`, which
-are tried one by one.
-"""
+"""Whether SfM points lie in the frame of the cameras, and which slip explains it if they do not."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import permutations, product
-from typing import TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int, Shaped
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import distort_pixels
-from shellgs_method.geometry.camera import OPENGL, Camera, in_view, positions, project
+from shellgs_method.geometry.camera import Camera, in_view, positions, project
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.spread import spread
+from shellgs_method.registration.slips import OF_IMAGES, OF_TRANSFORMS, OfPoses, Slip, first_slip, slips
 
-UNITS = {
-    0.001: "are in millimetres instead of metres",
-    1000.0: "are in metres instead of millimetres",
-    0.01: "are in centimetres instead of metres",
-    100.0: "are in metres instead of centimetres",
-    0.3048: "are in feet instead of metres",
-    1 / 0.3048: "are in metres instead of feet",
-    0.0254: "are in inches instead of metres",
-    0.1: "are ten times too large",
-    10.0: "are ten times too small",
-}
-"""Mistaken units, by the factor that corrects them."""
-_AXES: dict[tuple[int, ...], str] = {
-    (1, -2, -3): "have OpenGL's axes instead of OpenCV's, or these instead of those",
-    (2, 1, 3): "have x and y (easting and northing) swapped",
-    (1, 3, -2): "have y up instead of z, or z instead of y",
-    (1, -3, 2): "have z up instead of y, or y instead of z",
-}
-"""Axes that are usually confused, by the numbers and signs of those that correct it."""
 _FEW = 10  # points that show nothing
 _POINTS, _PHOTOGRAPHS, _SIZE = 1000, 6, 400  # that suffice
 _OBSERVATIONS = 50  # that suffice to compare colours
@@ -63,100 +38,6 @@ _OWN, _MORE = 0.6, 0.2
 _MOSTLY = 0.8  # of the points, which nobody ignores to keep people and cars, or even plants, out of a training
 _DRIFTED = 0.01  # of a photograph's sides: points of 450 models are within .003 of their keypoints in the median
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
-
-
-@dataclass(frozen=True)
-class Slip:
-    """A mistake in the export of points.
-
-    Attributes:
-        words: what is wrong with them.
-        correction: linear map that corrects it.
-    """
-
-    words: str
-    correction: Float64[np.ndarray, "3 3"]
-
-    def corrected(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-        """The points without the mistake."""
-        return points @ self.correction.T
-
-
-_QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-_ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
-_OfPoses: TypeAlias = Sequence[tuple[str, Callable[[np.ndarray], np.ndarray]]]
-"""Mistakes in poses, and what brings the world to the camera without them."""
-_OF_TRANSFORMS: _OfPoses = (
-    (
-        "transform_matrix has OpenCV's axes of the camera instead of OpenGL's: negate its second and third columns",
-        lambda viewmat: OPENGL @ viewmat,
-    ),
-    (
-        "transform_matrix is from the world to the camera: invert it",
-        lambda viewmat: OPENGL @ np.linalg.inv(OPENGL @ viewmat),
-    ),
-    (
-        "transform_matrix is from the world to the camera, in OpenCV's axes: invert it, and negate the second and "
-        "third columns of that",
-        lambda viewmat: np.linalg.inv(OPENGL @ viewmat),
-    ),
-    (_ROLLED.format(180), lambda viewmat: np.diag([-1.0, -1.0, 1.0, 1.0]) @ viewmat),
-    (_ROLLED.format(90), lambda viewmat: _QUARTER @ viewmat),
-    (_ROLLED.format(90), lambda viewmat: _QUARTER.T @ viewmat),
-)
-"""Mistakes of a transforms.json."""
-
-
-def _reordered(viewmat: np.ndarray) -> np.ndarray:
-    """The pose whose quaternion was written x y z w and read as w x y z."""
-    reordered = viewmat.copy()
-    reordered[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(viewmat[:3, :3]).as_quat(), 1)).as_matrix()
-    return reordered
-
-
-_OF_IMAGES: _OfPoses = (
-    (
-        "poses of images.txt are those of the cameras, but COLMAP's are from the world to the camera: invert them",
-        np.linalg.inv,
-    ),
-    ("quaternions of images.txt are in the order x y z w, but COLMAP's is w x y z", _reordered),
-    (
-        "poses of images.txt have OpenGL's axes of the camera instead of OpenCV's: negate the second and third rows of "
-        "their matrices from the world to the camera",
-        lambda viewmat: OPENGL @ viewmat,
-    ),
-)
-"""Mistakes of a COLMAP model."""
-
-
-def slips() -> Iterator[Slip]:
-    """Usual mistakes, likelier ones first: axes that are usually confused, units, any axes, axes with units."""
-    axes = {tuple(s * (k + 1) for s, k in zip(signs, order, strict=True)): np.diag(signs) @ np.eye(3)[list(order)]
-            for order in permutations(range(3)) for signs in product((1, -1), repeat=3)}  # fmt: skip
-    del axes[1, 2, 3]
-    turned = {numbers: Slip(_axes_in_words(numbers), matrix) for numbers, matrix in axes.items()}
-    scaled = [Slip(words, factor * np.eye(3)) for factor, words in UNITS.items()]
-    yield from (turned[numbers] for numbers in _AXES)
-    yield from scaled
-    yield from (slip for numbers, slip in turned.items() if numbers not in _AXES)
-
-
-def _axes_in_words(numbers: tuple[int, ...]) -> str:
-    name = " ".join(("-" if number < 0 else "") + "xyz"[abs(number) - 1] for number in numbers)
-    return f"{_AXES.get(numbers, 'have other axes')}: as {name} they fit"
-
-
-def first_slip(points: Float64[np.ndarray, "N 3"], fits: Callable[[np.ndarray], bool]) -> Slip | None:
-    """The likeliest mistake whose correction makes the points fit; None if none does."""
-    return next((slip for slip in slips() if fits(slip.corrected(points))), None)
-
-
-def in_degrees(points: Float64[np.ndarray, "N 3"], size: float) -> bool:
-    """Whether points, which spread over something of this size, are longitudes and latitudes, in either order."""
-    flat = np.abs(points[:, :2])
-    a_degree = 1.0  # a building is less than a hundredth of one wide
-    small = 0 < np.ptp(points[:, :2], axis=0).max() < min(0.01 * a_degree, 0.05 * size)  # 0: above each other
-    return bool(small and flat.max() <= 180 and flat.min(axis=1).max() <= 90)
 
 
 def check_points(points: SparsePoints, views: Sequence[View]) -> None:
@@ -198,7 +79,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
         return
     apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
     remedy = "export cameras and points from one program, in one frame"
-    of_poses = sight.explanation_by_poses(seen, _OF_TRANSFORMS if transforms.NAME in points.called else _OF_IMAGES)
+    of_poses = sight.explanation_by_poses(seen, OF_TRANSFORMS if transforms.NAME in points.called else OF_IMAGES)
     slip = sight.explanation(seen, away)
     if of_poses and (slip is None or sight.observed is not None):
         raise SceneError(f"the cameras do not see {points.called} where the photographs show them: {of_poses}")
@@ -328,7 +209,7 @@ class _Sight:
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
         return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
 
-    def explanation_by_poses(self, seen: float, mistakes: _OfPoses) -> str | None:
+    def explanation_by_poses(self, seen: float, mistakes: OfPoses) -> str | None:
         """The mistake in the poses without which cameras see the points, in these colours where they have some."""
         found = [(self._moved(change), words) for words, change in mistakes]
         if not self.photographs:

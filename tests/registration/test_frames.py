@@ -22,7 +22,8 @@ from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
-from shellgs_method.registration.sfm_frame import _Sight, check_points, in_degrees, slips
+from shellgs_method.registration.sfm_frame import _Sight, check_points
+from shellgs_method.registration.slips import in_degrees, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
 MILLIMETRES = "are in millimetres instead of metres"
