@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import os
 import shlex
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import metadata
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.bounds import FromOne, Length, check_bounds
 from shellgs_method.commands.align import align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
 from shellgs_method.commands.common import console, open_page, shell_words
 from shellgs_method.commands.mesh import mesh
-from shellgs_method.commands.sim import check_packages
+from shellgs_method.commands.recipe import Recipe, cameras_of, settled
 from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
+from shellgs_method.files.atomic import content_hash, fingerprint
 from shellgs_method.files.locks import alone_in
 from shellgs_method.files.record import Record
 from shellgs_method.files.scene import ALIGNMENT
@@ -34,124 +31,7 @@ if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """Settings of all steps."""
-
-    sources: Annotated[
-        tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="[VIDEO SHELL [SHELL ...]]", help_behavior_hint=""),
-    ] = ()
-    """Video or folder of photographs, then the files of the shell. Not again when the run goes on."""
-    picks: Optional[Path] = None
-    """Text file of picked points, as `shellgs align` takes it."""
-    matrix: Optional[Path] = None
-    """File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy)."""
-    positions: Optional[Path] = None
-    """Text file of RTK camera positions, as `shellgs align` takes it."""
-    same_frame: bool = False
-    """The shell is in the frame and unit of the cameras: both are of one project of photogrammetry."""
-    refine: Optional[Length] = None
-    """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
-    bundle_adjust: bool = False
-    """Then adjust the cameras to the shell."""
-    metres_per_shell_unit: Length = 1.0
-    """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
-    crs: Optional[str] = None
-    """Coordinate reference system of the shell, such as EPSG:25832. If not set: as the shell's file says."""
-    max_image_size: Optional[FromOne] = None
-    """Longer side in pixels that photographs are resized to for training. If not set: full size."""
-    method: str = "shellgs-metric"
-    """Method to train."""
-    iterations: FromOne = 30_000
-    """Training iterations."""
-    sim: bool = False
-    """Also write a folder for simulators."""
-
-    @property
-    def starts(self) -> dict[str, Any]:
-        """What the alignment starts from, as arguments of :func:`align`; nothing for a proposal."""
-        given = {name: getattr(self, name) for name in ("matrix", "picks", "positions", "same_frame")}
-        return {name: value for name, value in given.items() if value}
-
-    def located(self, place: Callable[[Path], Path]) -> Recipe:
-        """The recipe with other paths."""
-        paths = {name: place(path) for name in ("picks", "matrix", "positions") if (path := getattr(self, name))}
-        return replace(self, sources=tuple(map(place, self.sources)), **paths)
-
-    @classmethod
-    def load(cls, file: Path) -> Recipe:
-        """Read what :meth:`save` wrote and a person may have changed; a wrong flag ends the program with a message.
-
-        Raises:
-            SceneError: a quote is not closed, or it is no text.
-        """
-        try:
-            words = shlex.split(file.read_text("utf-8-sig"), comments=True)  # whatever Windows' language is
-        except ValueError as error:
-            raise SceneError(f"{file} cannot be read ({error}): correct it") from error
-        return tyro.cli(cls, args=words, prog=str(file)).located(lambda path: file.parent / path)
-
-    def save(self, file: Path) -> None:
-        """Write the settings as words of the command line; paths in the file's folder are relative to it."""
-        folder = file.parent.resolve()
-
-        def word(value: object) -> str:
-            if isinstance(value, Path) and value.resolve().is_relative_to(folder):
-                value = f"./{value.resolve().relative_to(folder)}"  # not taken for a flag
-            return shlex.quote(str(value.resolve() if isinstance(value, Path) else value))
-
-        lines = [" ".join(map(word, self.sources))]
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            if value != field.default:
-                lines.append(_flag(field.name) + ("" if value is True else f" {word(value)}"))
-        write_whole(file, "\n".join(["# Settings of `shellgs run`: change them, and run it again.", *lines, ""]))
-
-    def check(self) -> None:
-        """Refuse what would fail hours later.
-
-        Raises:
-            FileNotFoundError: a file is missing.
-            SceneError: there is no video and scan, or a setting cannot be used.
-        """
-        from shellgs_method.compare.runs import Variant
-        from shellgs_method.files.crs import given_crs
-
-        if len(self.sources) < 2:
-            raise SceneError("give a video (or a folder of photographs) and a scan")
-        for path in (*self.sources, self.picks, self.matrix, self.positions):
-            if path and not path.exists():
-                later = path == self.picks and ": leave --picks out until `shellgs pick` or a text editor has made it"
-                raise FileNotFoundError(f"{path} does not exist{later or ''}")
-        scene = self.sources[0]
-        if any(cameras.exists() for cameras in _cameras(scene)):
-            raise SceneError(
-                f"{scene} is a scene with cameras: give its photographs, {scene / 'images'}, and --scene {scene}"
-            )
-        if len(self.starts) > 1:
-            raise SceneError(f"the alignment starts from one of {', '.join(map(_flag, self.starts))}")
-        check_bounds(Recipe, vars(self))
-        if self.crs:
-            given_crs(self.crs)
-        Variant.parse(self.method)
-        if self.sim:
-            check_packages()
-
-
 _DEFAULT = Recipe()
-
-
-def _cameras(scene: Path) -> list[Path]:
-    """Where a scene has its cameras, in one of these."""
-    from shellgs_method.files import colmap, transforms
-
-    return [scene / place for place in (*colmap.PLACES, transforms.NAME)]
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def run(
@@ -172,7 +52,7 @@ def run(
         accept: Go on with the alignment that the report shows.
     """
     scene = scene if scene.name not in ("", "..") else scene.resolve()
-    recipe = _settled(recipe, scene.with_name(f"{scene.name}.run"))
+    recipe = settled(recipe, scene.with_name(f"{scene.name}.run"))
     results = scene.with_name(f"{scene.name}-results")
     steps = results / "steps"
     steps.mkdir(parents=True, exist_ok=True)
@@ -232,39 +112,6 @@ def _take_all_steps(recipe: Recipe, scene: Path, results: Path, accept: bool, do
     return trained.config
 
 
-def _settled(recipe: Recipe, file: Path) -> Recipe:
-    """The settings given at the first run, or else those of the file.
-
-    Raises:
-        SceneError: there are none, or some are given again that differ from the file's.
-    """
-    if not file.is_file():
-        if not recipe.sources:
-            others = [f"--scene {shlex.quote(str(other.with_suffix('')))}" for other in file.parent.glob("*.run")]
-            hint = f"; or go on with {' or '.join(others)}" if others else ""
-            raise SceneError(
-                f"there is no {file} to go on with: give a video (or a folder of photographs) and a scan{hint}"
-            )
-        recipe.check()
-        recipe.save(file)
-        return recipe
-    stored = Recipe.load(file)
-    given, known = (vars(each.located(Path.resolve)) for each in (recipe, stored))
-    # A value may be the default, and yet given; tyro takes underscores and --no-sim too.
-    typed = {word.partition("=")[0].replace("_", "-").replace("--no-", "--", 1) for word in sys.argv}
-    for field in fields(Recipe):
-        named = recipe.sources if field.name == "sources" else _flag(field.name) in typed
-        if named and given[field.name] != known[field.name]:
-            raise SceneError(
-                f"{file} has other {field.name.replace('_', ' ')}: change that there, or give another --scene"
-            )
-    try:
-        stored.check()
-    except (SceneError, FileNotFoundError) as error:
-        raise SceneError(f"{error}; the settings are in {file}") from error
-    return stored
-
-
 def _capture(recipe: Recipe, scene: Path, done: Record) -> None:
     """Find the cameras, unless there are some of these photographs."""
     video = recipe.sources[0]
@@ -272,7 +119,7 @@ def _capture(recipe: Recipe, scene: Path, done: Record) -> None:
     beside = fingerprint(os.path.relpath(video.resolve(), scene.resolve()))
     # Where a project was copied to, its photographs are beside it as before.
     of_another = "capture" in done and not (done.has("capture", place) or done.has("capture beside", beside))
-    if of_another or not any(cameras.exists() for cameras in _cameras(scene)):
+    if of_another or not any(cameras.exists() for cameras in cameras_of(scene)):
         capture(video, scene)
         done.note("capture", place)
         done.note("capture beside", beside)
@@ -291,7 +138,7 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     from shellgs_method.shell import Alignment
 
     shell = recipe.sources[1:]
-    files = *shell, recipe.matrix, recipe.picks, recipe.positions, *_cameras(scene)
+    files = *shell, recipe.matrix, recipe.picks, recipe.positions, *cameras_of(scene)
     hashes = [path and path.exists() and content_hash(path) for path in files]
     settings = recipe.refine, recipe.metres_per_shell_unit, recipe.crs, recipe.bundle_adjust, recipe.same_frame
     key, report = fingerprint(*hashes, *settings), scene / REPORT / "index.html"

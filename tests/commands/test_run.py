@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from shellgs_method.commands import run as run_command
-from shellgs_method.commands.run import Recipe
+from shellgs_method.commands.recipe import Recipe
 from shellgs_method.registration.align import PROPOSAL
 from shellgs_method.registration.validation import LIKELIER
 from shellgs_method.shell import ALIGNMENT, Alignment
