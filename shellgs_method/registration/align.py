@@ -13,7 +13,8 @@ import numpy as np
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.colmap import read_model, read_points
-from shellgs_method.files.crs import crs_of, crs_there, given_crs, metres_of
+from shellgs_method.files.crs import crs_there, given_crs
+from shellgs_method.files.crs_of_files import crs_of, metres_of
 from shellgs_method.files.cue_maps import relative_path
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import ADJUSTED, ALIGNMENT, SceneLayout

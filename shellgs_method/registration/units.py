@@ -12,7 +12,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from shellgs_method.files.crs import IN_METRES
+from shellgs_method.files.crs_of_files import IN_METRES
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import transformed

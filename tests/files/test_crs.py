@@ -16,16 +16,8 @@ from laspy.vlrs.known import GeoKeyEntryStruct
 from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.crs import (
-    conversion,
-    converter,
-    crs_of,
-    crs_there,
-    given_crs,
-    known_crs,
-    metres_of,
-    name_of,
-)
+from shellgs_method.files.crs import conversion, converter, crs_there, given_crs, known_crs, name_of
+from shellgs_method.files.crs_of_files import crs_of, metres_of
 
 UTM = "EPSG:25832"
 

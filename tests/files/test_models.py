@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.panels import supervision_panel
-from shellgs_method.files.crs import crs_of, metres_of
+from shellgs_method.files.crs_of_files import crs_of, metres_of
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.files.surfaces import read_geometry

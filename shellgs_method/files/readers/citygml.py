@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.crs import metres_of_degrees
+from shellgs_method.files.crs_of_files import metres_of_degrees
 from shellgs_method.files.readers.city import CityObject, Polygon, is_surface, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry, numbers_in
 from shellgs_method.geometry.similarity import transformed

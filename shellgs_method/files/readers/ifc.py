@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.crs import models_of
+from shellgs_method.files.crs_of_files import models_of
 from shellgs_method.files.readers.contents import Geometry, say_left_out
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
