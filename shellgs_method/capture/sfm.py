@@ -14,7 +14,7 @@ import shutil
 import sys
 import threading
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from functools import cache, partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -22,140 +22,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
+from database import copied
+from features import CALIBRATED, MIN_CALIBRATED, extract, has_rigs, rig_of, write_image
+from loops import CONFIRMED, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut
+from models import SEED, forget, join, read_models, registered, verified, views_of
+from zoom import zoomed
 
-from database import copied  # pyright: ignore[reportMissingImports]  isort: skip
-from loops import CONFIRMED, DRIFT, View, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
-from zoom import zoomed  # pyright: ignore[reportMissingImports]  isort: skip
-
-SEED = 0
 _RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
-_CALIBRATED = "SIMPLE_PINHOLE"  # model of cameras whose focal length is known, as no others have
 _BRIDGES = 16  # views of a model that are matched with those of another, if there are two
-_MIN_JOINING = 30  # matches of points that join two models
-_RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
-_FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
-_CREDIBLE = 0.3, 10.0  # widths that EXIF may say, 11 to 360 mm on 35 mm film; 4 times the true one does no harm
 _NEAR = 10  # photographs, within which they are neighbours along a walk
-_LARGE = 1300  # pixels of photographs that need no doubled image; of 29 of 1024 pixels along a street, all did
-_MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 _LEAST_POINTS = 10  # of a photograph with a camera: 17 and more of right ones, incremental mapping places none by 30
-
-
-def extract(
-    database: str,
-    photographs: str,
-    lenses: list[dict],
-    rigs: list[list[dict]],
-    masks: str | None,
-    sift: dict,
-    contrasts: dict[str, float],
-    camera_model: str,
-) -> None:
-    """Extract features of all photographs that have none yet; each lens is one camera.
-
-    Args:
-        database: COLMAP's database.
-        photographs: folder of the photographs.
-        lenses: size and names of the photographs that share a camera, and its focal length in pixels, if it is known,
-            or that to begin with, ``shrunk``, if it is not what EXIF says.
-        rigs: cameras that move together: the prefix of their photographs' names, whose rest is the same for those that
-            are taken at once, and the rotation from the first camera.
-        masks: folder of masks, ``<name>.png``, black where no features are wanted; white ones are added for photographs
-            without one, which COLMAP would leave out.
-        sift: maximum image size, number of features, and first octave for large photographs: 0 skips the doubled image,
-            which smaller photographs need.
-        contrasts: contrast of each photograph relative to one by day: features of COLMAP have a least contrast, and at
-            a fifth of the light one in 25 was left.
-        camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
-    """
-    for lens in lenses:
-        if masks:
-            _add_white(Path(masks), lens["names"], lens["size"])
-        reader = pycolmap.ImageReaderOptions(
-            camera_model=camera_model if len(lens["names"]) >= _MIN_CALIBRATED else "SIMPLE_RADIAL",
-            mask_path=masks or "",
-            default_focal_length_factor=_FOCAL,
-        )
-        if lens["focal"]:
-            width, height = lens["size"]
-            reader.camera_model = _CALIBRATED
-            reader.camera_params = f"{lens['focal']},{width / 2},{height / 2}"
-        for contrast in sorted({contrasts[name] for name in lens["names"]}):
-            if camera := _camera_of(database, lens["names"]):
-                reader.existing_camera_id = camera
-            options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
-            options.sift.max_num_features = sift["max_num_features"]
-            options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= _LARGE else -1
-            options.sift.peak_threshold *= contrast
-            pycolmap.extract_features(
-                database,
-                photographs,
-                image_names=[name for name in lens["names"] if contrasts[name] == contrast],
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-            )
-    with pycolmap.Database.open(database) as opened:
-        used = {image.name: image.camera_id for image in opened.read_all_images()}
-        if unread := [name for lens in lenses for name in lens["names"] if name not in used]:
-            raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
-        shrunk = {used[lens["names"][0]]: lens["shrunk"] for lens in lenses if lens.get("shrunk")}
-        for camera in opened.read_all_cameras():
-            if focal := shrunk.get(camera.camera_id):
-                _begin_with(opened, camera, focal)
-            _forget_absurd_focal(opened, camera)
-        if rigs and not _has_rigs(opened):
-            pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
-
-
-def _camera_of(database: str, names: list[str]) -> int | None:
-    """The camera of a lens, if some of its photographs have been read, perhaps by a run that was interrupted."""
-    with pycolmap.Database.open(database) as opened:
-        images = opened.read_all_images()
-        cameras = {image.camera_id for image in images if image.name in names}
-        # A camera is written before the features of its first photograph.
-        unused = {camera.camera_id for camera in opened.read_all_cameras()} - {image.camera_id for image in images}
-    return min(cameras or unused, default=None)
-
-
-def _forget_absurd_focal(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
-    """Let a camera's focal length be found where EXIF says what no camera has; some write millimetres of the sensor."""
-    width, (low, high) = max(camera.width, camera.height), _CREDIBLE
-    if camera.has_prior_focal_length and not low < camera.mean_focal_length() / width < high:
-        camera.has_prior_focal_length = False
-        _begin_with(database, camera, _FOCAL * width)
-
-
-def _begin_with(database: pycolmap.Database, camera: pycolmap.Camera, focal: float) -> None:
-    for k in camera.focal_length_idxs():
-        camera.params[k] = focal
-    database.update_camera(camera)
-
-
-def _add_white(masks: Path, names: list[str], size: list[int]) -> None:
-    """Write white masks for the photographs of a size that have none."""
-    for target in (masks / f"{name}.png" for name in names):
-        if not target.is_file():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            _write(np.full(size[::-1], 255, np.uint8), target)
-
-
-def _has_rigs(database: pycolmap.Database) -> bool:
-    return any(rig.num_sensors() > 1 for rig in database.read_all_rigs())
-
-
-def _rig(cameras: list[dict]) -> pycolmap.RigConfig:
-    configs = []
-    for number, camera in enumerate(cameras):
-        config = pycolmap.RigConfigCamera()
-        config.ref_sensor, config.image_prefix = number == 0, camera["prefix"]
-        if number and "rotation" in camera:
-            config.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(camera["rotation"])), np.zeros(3))
-        configs.append(config)
-    rig = pycolmap.RigConfig()
-    rig.cameras = configs
-    return rig
 
 
 def match(database: str, pairs: list[list[str]]) -> None:
@@ -164,7 +41,7 @@ def match(database: str, pairs: list[list[str]]) -> None:
         numbers = {image.name: image.image_id for image in opened.read_all_images()}
         wanted = {pycolmap.image_pair_to_pair_id(numbers[a], numbers[b]) for a, b in pairs}
         for pair in {pair for pair, _ in zip(*opened.read_all_matches(), strict=True)} - wanted:  # of other settings
-            _forget(opened, *pycolmap.pair_id_to_image_pair(pair), matches=True)
+            forget(opened, *pycolmap.pair_id_to_image_pair(pair), matches=True)
     listed = Path(database).with_name("pairs.txt")
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
     verification = pycolmap.TwoViewGeometryOptions()
@@ -172,10 +49,10 @@ def match(database: str, pairs: list[list[str]]) -> None:
     # A time stamp or the bonnet of a car stands at the same pixels, and says that the camera stood still.
     verification.filter_stationary_matches = True
     with pycolmap.Database.open(database) as opened:
-        has_rigs = _has_rigs(opened)
+        is_rigged = has_rigs(opened)
     pycolmap.match_image_pairs(
         database,
-        matching_options=pycolmap.FeatureMatchingOptions(rig_verification=has_rigs),
+        matching_options=pycolmap.FeatureMatchingOptions(rig_verification=is_rigged),
         pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
         verification_options=verification,
     )
@@ -198,7 +75,7 @@ def follow(database: str, passes: list[list[str]]) -> list[list[str]]:
         xy = {number: opened.read_keypoints(number)[:, :2].astype(float) for number in images}
         width = {number: opened.read_camera(image.camera_id).width for number, image in images.items()}
         pairs = []
-        for a, b, matches in _verified(opened):
+        for a, b, matches in verified(opened):
             if a in images and b in images and len(matches):
                 if at[images[a].name] > at[images[b].name]:
                     a, b, matches = b, a, matches[:, ::-1]
@@ -219,38 +96,13 @@ def follow(database: str, passes: list[list[str]]) -> list[list[str]]:
 
 def find_bridges(models: str) -> list[list[str]]:
     """Pairs of names to match between models."""
-    groups = [sorted((image.name for image in _registered(model)), key=along_the_walk) for model in _read(models)]
+    groups = [sorted((image.name for image in registered(model)), key=along_the_walk) for model in read_models(models)]
     return [list(pair) for pair in bridges(groups, max(_BRIDGES // max(1, len(groups) - 1), 4))]
-
-
-def join(database: str, models: str, output: str) -> list[dict]:
-    """Write models in the frame of the largest, as far as matches agree on one; return names and faults of the others.
-
-    The similarity of a model is one that most matches between points agree on. If matches that do not agree with it
-    agree on another, as those of identical windows do, it is in doubt.
-    """
-    joined, apart = _read(models)[:1], _read(models)[1:]
-    faults: dict[int, str] = {}
-    while True:
-        for model in apart:
-            similarity, faults[id(model)] = _similarity(database, model, joined)
-            if similarity is not None:
-                model.transform(similarity)
-                joined.append(model)
-                apart.remove(model)
-                break
-        else:
-            break
-    for k, model in enumerate(joined):
-        folder = Path(output) / str(k)
-        folder.mkdir()
-        model.write(folder)
-    return [{"names": [image.name for image in _registered(model)], "fault": faults[id(model)]} for model in apart]
 
 
 def find_loops(models: str, matched: list[list[str]], each: int) -> list[list[str]]:
     """Pairs of names that see the same by the joined models: ``each`` for each photograph beside the matched ones."""
-    views, points = _views(_read(models))
+    views, points = views_of(read_models(models))
     names = list(views)
     number = {name: k for k, name in enumerate(names)}
     known = {(number[a], number[b]) for a, b in matched if a in number and b in number}
@@ -260,19 +112,19 @@ def find_loops(models: str, matched: list[list[str]], each: int) -> list[list[st
 
 def settle(database: str, models: str, trusted: list[list[str]]) -> int:
     """Forget matches of all but the trusted pairs that the joined models contradict; return how many pairs are left."""
-    views, points = _views(_read(models))
+    views, points = views_of(read_models(models))
     known = {frozenset(pair) for pair in trusted}
     kept = 0
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
-        for a, b, matches in _verified(opened):
+        for a, b, matches in verified(opened):
             if {names[a], names[b]} in known:
                 continue
             both = names[a] in views and names[b] in views
             if both and agree(views[names[a]], views[names[b]], points, matches):
                 kept += 1
             else:
-                _forget(opened, a, b)
+                forget(opened, a, b)
     return kept
 
 
@@ -285,10 +137,10 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
     with one that pairs agree on.
     """
     with pycolmap.Database.open(database) as opened:
-        count, is_global = opened.num_images(), has_parallax and not _has_rigs(opened)
-        known = {camera.camera_id for camera in opened.read_all_cameras() if camera.model.name == _CALIBRATED}
+        count, is_global = opened.num_images(), has_parallax and not has_rigs(opened)
+        known = {camera.camera_id for camera in opened.read_all_cameras() if camera.model.name == CALIBRATED}
         rigs = {rig.rig_id for rig in opened.read_all_rigs() if rig.ref_sensor_id.id in known}
-        is_alone = not known and not _has_rigs(opened)
+        is_alone = not known and not has_rigs(opened)
     weakest = cache(partial(_weakest, database))
 
     def fitting(models: Collection[pycolmap.Reconstruction]) -> tuple[int, float]:
@@ -319,12 +171,12 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
         ranked[0].write(output)
     return [
         {
-            "names": sorted(image.name for image in _registered(model)),
+            "names": sorted(image.name for image in registered(model)),
             "points": model.num_points3D(),
             "reprojection_error": model.compute_mean_reprojection_error(),
             "track_length": model.compute_mean_track_length(),
             "torn": weakest(model).between if weakest(model).confirmed < CONFIRMED else None,
-            "zoomed": zoomed(model, _registered(model), _MIN_CALIBRATED) if is_alone and model is ranked[0] else None,
+            "zoomed": zoomed(model, registered(model), MIN_CALIBRATED) if is_alone and model is ranked[0] else None,
             "lenses": _shared_lenses(model),
         }
         for model in ranked
@@ -347,13 +199,13 @@ def _placed(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _shared_lenses(model: pycolmap.Reconstruction) -> list[dict]:
     """Names of the photographs of each lens that several have, and the focal lengths found, across and down."""
     names: dict[int, list[str]] = {}
-    for image in _registered(model):
+    for image in registered(model):
         names.setdefault(image.camera_id, []).append(image.name)
     found = [(model.camera(number), several) for number, several in names.items() if len(several) > 1]
     return [
         {"names": several, "focal": [camera.focal_length_x, camera.focal_length_y]}
         for camera, several in found
-        if camera.model.name != _CALIBRATED
+        if camera.model.name != CALIBRATED
     ]
 
 
@@ -364,7 +216,7 @@ class _Weakest(NamedTuple):
 
 def _weakest(database: str, model: pycolmap.Reconstruction) -> _Weakest:
     """Share of the matches of neighbours that a model confirms where it does least, and the names around that place."""
-    images = sorted(_registered(model), key=lambda image: along_the_walk(image.name))
+    images = sorted(registered(model), key=lambda image: along_the_walk(image.name))
     at = {image.image_id: k for k, image in enumerate(images)}
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
@@ -372,7 +224,7 @@ def _weakest(database: str, model: pycolmap.Reconstruction) -> _Weakest:
     }
     rows = []
     with pycolmap.Database.open(database) as opened:
-        for a, b, matches in _verified(opened):
+        for a, b, matches in verified(opened):
             if a in at and b in at and abs(at[a] - at[b]) <= _NEAR and len(matches):
                 of_a, of_b = points[a][matches[:, 0]], points[b][matches[:, 1]]
                 rows.append([*sorted((at[a], at[b])), ((of_a == of_b) & (of_a >= 0)).sum(), len(matches)])
@@ -395,7 +247,7 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
         and how it moved against it, in degrees and in steps from one shot to the next, the medians.
     """
     single = pycolmap.Reconstruction(model)
-    poses = {image.name: image.cam_from_world() for image in _registered(single)}
+    poses = {image.name: image.cam_from_world() for image in registered(single)}
     first = [poses[name] for name in sorted(poses, key=along_the_walk) if name.startswith(prefixes[0])]
     path = np.array([pose.inverse().translation for pose in first]).reshape(-1, 3)
     step = np.median(np.linalg.norm(np.diff(path, axis=0), axis=1)) if len(path) > 1 else 0.0
@@ -410,7 +262,7 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
         if turned > _RIGID_DEGREES or moved > _RIGID_STEPS:
             return {"loose": [prefix, float(turned), float(moved)]}
     with pycolmap.Database.open(database) as opened:
-        pycolmap.apply_rig_config([_rig([{"prefix": prefix} for prefix in prefixes])], opened, single)
+        pycolmap.apply_rig_config([rig_of([{"prefix": prefix} for prefix in prefixes])], opened, single)
     for numbered in filter(Path.is_dir, Path(model).iterdir()):
         shutil.rmtree(numbered)
     return {"models": reconstruct(database, photographs, model, has_parallax=True)}
@@ -426,92 +278,6 @@ def _calibrated(database: str, folder: str) -> str:
     return copy
 
 
-def _read(models: str) -> list[pycolmap.Reconstruction]:
-    """The models in a folder's numbered folders, largest first."""
-    read = [pycolmap.Reconstruction(folder) for folder in sorted(Path(models).iterdir()) if folder.is_dir()]
-    return sorted(read, key=lambda model: -model.num_reg_images())
-
-
-def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [model.image(i) for i in model.reg_image_ids()]
-
-
-def _views(models: list[pycolmap.Reconstruction]) -> tuple[dict[str, View], np.ndarray]:
-    """Views by the names of their photographs, and the points, of models in one frame."""
-    views, positions = {}, [np.zeros((0, 3))]
-    for model in models:
-        start, numbers = sum(map(len, positions)), {point: k for k, point in enumerate(model.points3D)}
-        positions.append(np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3))
-        for image in _registered(model):
-            camera = model.camera(image.camera_id)
-            size, centre = (
-                np.array([camera.width, camera.height]),
-                np.array([camera.principal_point_x, camera.principal_point_y]),
-            )
-            focal = np.array([camera.focal_length_x, camera.focal_length_y])
-            features = np.asarray(camera.cam_from_img(np.array([point.xy for point in image.points2D])))
-            points = [start + numbers[p.point3D_id] if p.has_point3D() else -1 for p in image.points2D]
-            extent = np.maximum(centre, size - centre) / focal
-            views[image.name] = View(image.cam_from_world().matrix(), extent, features, np.array(points))
-    return dict(sorted(views.items())), np.concatenate(positions)
-
-
-def _verified(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Numbers of the images of each verified pair, and its matches (M, 2)."""
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        yield *pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
-
-
-def _forget(database: pycolmap.Database, a: int, b: int, *, matches: bool = False) -> None:
-    if matches and database.exists_matches(a, b):
-        database.delete_matches(a, b)
-    if database.exists_two_view_geometry(a, b):
-        database.delete_two_view_geometry(a, b)
-
-
-def _similarity(
-    database: str, model: pycolmap.Reconstruction, joined: list[pycolmap.Reconstruction]
-) -> tuple[pycolmap.Sim3d | None, str]:
-    """Similarity from a model's frame to that of the joined ones; if there is none, why."""
-    own, own_points = _views([model])
-    others, their_points = _views(joined)
-    source, target, distances = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        for a, b, matches in _verified(opened):
-            if names[a] in others and names[b] in own:
-                a, b, matches = b, a, matches[:, ::-1]
-            if names[a] not in own or names[b] not in others:
-                continue
-            view, other = own[names[a]], others[names[b]]
-            known = matches[(view.points[matches[:, 0]] >= 0) & (other.points[matches[:, 1]] >= 0)]
-            source.append(own_points[view.points[known[:, 0]]])
-            target.append(their_points[other.points[known[:, 1]]])
-            distances.append(np.linalg.norm(target[-1] - other.position, axis=1))
-    X, Y, tolerance = np.concatenate(source), np.concatenate(target), DRIFT * np.concatenate(distances)
-    best, agreeing = _consensus(X, Y, tolerance)
-    if best is None or agreeing.sum() < _MIN_JOINING:
-        return None, "no photographs of it match others"
-    _, rivals = _consensus(X[~agreeing], Y[~agreeing], tolerance[~agreeing])
-    if rivals.sum() > _RIVAL * agreeing.sum():
-        return None, "its matches with others, perhaps of identical windows, contradict each other"
-    return best, ""
-
-
-def _consensus(X: np.ndarray, Y: np.ndarray, tolerance: np.ndarray) -> tuple[pycolmap.Sim3d | None, np.ndarray]:
-    """Similarity from points X to Y that most agree with, and which do."""
-    nobody = np.zeros(len(X), bool)
-    if len(X) < _MIN_JOINING:
-        return None, nobody
-    options = pycolmap.RANSACOptions(max_error=float(np.median(tolerance)), random_seed=SEED, min_inlier_ratio=0.05)
-    found = pycolmap.estimate_sim3d_robust(X, Y, options)
-    if found is None:
-        return None, nobody
-    similarity = found["tgt_from_src"]  # pyright: ignore[reportIndexIssue]  the stub leaves out the dict
-    moved = X @ similarity.matrix()[:, :3].T + similarity.matrix()[:, 3]
-    return similarity, np.linalg.norm(moved - Y, axis=1) < tolerance
-
-
 def undistort(model: str, photographs: str, masks: str | None, output: str) -> None:
     """Write undistorted photographs and masks and the model of their pinhole cameras.
 
@@ -522,8 +288,8 @@ def undistort(model: str, photographs: str, masks: str | None, output: str) -> N
     if masks is None:
         return
     reconstruction = pycolmap.Reconstruction(model)
-    stems = Counter(PurePath(image.name).with_suffix("") for image in _registered(reconstruction))
-    for image in _registered(reconstruction):
+    stems = Counter(PurePath(image.name).with_suffix("") for image in registered(reconstruction))
+    for image in registered(reconstruction):
         camera = reconstruction.camera(image.camera_id)
         mask = pycolmap.Bitmap.read(Path(masks) / f"{image.name}.png", as_rgb=False)
         if mask is None:
@@ -532,12 +298,7 @@ def undistort(model: str, photographs: str, masks: str | None, output: str) -> N
         stem = PurePath(image.name).with_suffix("")
         target = Path(output) / "masks" / (f"{stem}.png" if stems[stem] == 1 else f"{image.name}.png")
         target.parent.mkdir(parents=True, exist_ok=True)
-        _write(np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8), target)
-
-
-def _write(pixels: np.ndarray, target: Path) -> None:
-    if not pycolmap.Bitmap.from_array(pixels).write(target):
-        raise OSError(f"{target} cannot be written")
+        write_image(np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8), target)
 
 
 def main() -> None:

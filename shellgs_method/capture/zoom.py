@@ -9,8 +9,7 @@ from collections import Counter
 
 import numpy as np
 import pycolmap
-
-from loops import along_the_walk  # pyright: ignore[reportMissingImports]  isort: skip
+from loops import along_the_walk
 
 _POINTS = 80  # of a photograph, by which its own focal length is found
 # F, deviation of focal lengths, and ratio of costs at which photographs have not one camera. Right models have an F of

@@ -358,14 +358,14 @@ pycolmap.set_random_seed(0)
 options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=200)
 model = pycolmap.synthesize_dataset(options)
 pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
-found = [sfm.zoomed(model, sfm._registered(model), 10)]
+found = [sfm.zoomed(model, sfm.registered(model), 10)]
 images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
 for image in images[8:]:
     camera = model.camera(image.camera_id)
     for point in image.points2D:
         ray = camera.cam_from_img(point.xy)
         point.xy = pycolmap.Camera(camera.todict() | {"params": camera.params * [1.3, 1, 1, 1]}).img_from_cam([*ray, 1])
-found.append(sfm.zoomed(model, sfm._registered(model), 10))
+found.append(sfm.zoomed(model, sfm.registered(model), 10))
 steady = zoom._behind_a_step({f"{k}.jpg": 0.1 * k for k in range(12)})
 print(json.dumps([[*found, steady], [image.name for image in images]]))
 """
