@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from hypothesis import strategies as st
 from PIL import Image
-from scenes import write_colmap
+from scenes import views_of, write_colmap
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.dataset import FacadeDataset
@@ -104,7 +104,7 @@ class Workbench:
 
     def __init__(self, scene: Path):
         self.scene = scene
-        self.views: list[View] = read_views(FacadeDataParserConfig(data=scene))
+        self.views: list[View] = views_of(scene)
         self.points: SparsePoints = read_sparse_points(FacadeDataParserConfig(data=scene))
         self.alignment = Alignment.load(scene / ALIGNMENT)
         self.mesh: ShellMesh = load_shell(scene / self.alignment.shells[0])

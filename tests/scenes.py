@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig
+from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.photographs import View
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.shell.cast import CastSummary
@@ -24,6 +24,11 @@ PHONE = Path(__file__).with_name("phone.heic")
 
 def parse(scene: Path, split: str = "train", **config) -> DataparserOutputs:
     return FacadeDataParserConfig(data=scene, **config).setup().get_dataparser_outputs(split)
+
+
+def views_of(scene: Path, **config) -> list[View]:
+    """The photographs of a scene, with their cameras."""
+    return read_views(FacadeDataParserConfig(data=scene, **config))
 
 
 def write_colmap(scene: Path, views: list[View], ids: list[int], model: str = "PINHOLE", extra: str = "") -> None:

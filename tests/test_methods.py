@@ -14,12 +14,12 @@ import torch
 import tyro
 from gsplat.strategy.ops import duplicate, remove
 from nerfstudio.scripts.exporter import ExportGaussianSplat
+from scenes import views_of
 from torch.nn.functional import normalize
 from training_runs import data_of, held_out, model_of, render, trainer_of
 
 import method_configs
 from dataparsers.cameras import pinhole_camera
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.runs import PAPER
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import CueMap
@@ -47,7 +47,7 @@ def mono_scene(scene: Path) -> Path:
     """The scene with the truth as the maps of a perfect network, and no shell."""
     truth = CueMaps.open(scene, "truth")
     mono = CueMaps.create(scene, "mono", command="shellgs mono {scene}")
-    for view in read_views(FacadeDataParserConfig(data=scene)):
+    for view in views_of(scene):
         cue = truth.read(view.name, view.camera)
         assert cue is not None
         mono.write(view.name, CueMap(cue.depth, cue.normal, cue.mask), view.camera)

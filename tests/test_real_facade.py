@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
-from scenes import cast
+from scenes import cast, views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.shell import Alignment
 
@@ -27,7 +26,7 @@ def test_the_cast_shell_agrees_with_the_sfm_points(tmp_path: Path, name: str):
     shutil.copytree(DATA / name, scene, copy_function=os.symlink)
     shell = (f"shell/{SCENES[name]}",)
     alignment = Alignment.from_matrix_file(scene / "shell" / "shell_to_scene.txt", shell)
-    views = read_views(FacadeDataParserConfig(data=scene))[::8]
+    views = views_of(scene)[::8]
     cast(scene, views, alignment, max_image_size=384)
     maps = CueMaps.open(scene, "shell")
     cloud = read_points3D_binary(scene / "colmap" / "sparse" / "0" / "points3D.bin")

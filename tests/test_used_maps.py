@@ -12,10 +12,10 @@ import psutil
 import pytest
 import torch
 from PIL import Image
+from scenes import views_of
 from training_runs import data_of, model_of, render, trainer_of
 
 import method_configs
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
 from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.errors import SceneError
@@ -27,7 +27,7 @@ from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 
 def spoil(scene: Path, kind: str) -> None:
     """Write maps that belong to other cameras."""
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     maps = CueMaps.create(scene, kind, command=f"shellgs {kind} {{scene}}")
     nothing = CueMap(np.zeros((32, 48), np.float32), np.zeros((32, 48, 3), np.float16), np.zeros((32, 48), bool))
     for one, other in zip(views, views[1:] + views[:1], strict=True):
@@ -147,7 +147,7 @@ def test_a_resampled_map_equals_one_cast_at_that_size(scene, size):
     """On planes to float32's rounding; at edges the nearest pixel is taken."""
     alignment = Alignment.load(scene / ALIGNMENT)
     caster = ShellCaster(load_shell(scene / alignment.shells[0]), alignment.shell_to_scene)
-    camera = read_views(FacadeDataParserConfig(data=scene))[4].camera
+    camera = views_of(scene)[4].camera
     wanted = camera.resized(*size)
     resized, expected = resampled(caster.cast(camera), wanted), caster.cast(wanted)
     both = resized.mask & expected.mask
@@ -167,7 +167,7 @@ def test_missing_maps_of_all_views_are_refused_before_training(scene, tmp_path, 
         path.unlink()
     if empty:
         spoilt = CueMaps.open(scene, "shell")
-        for view in read_views(FacadeDataParserConfig(data=scene)):
+        for view in views_of(scene):
             shape = (view.camera.height, view.camera.width)
             nothing = CueMap(np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float16), np.zeros(shape, bool))
             spoilt.write(view.name, nothing, view.camera)
@@ -203,7 +203,7 @@ def test_memory_is_reported_and_maps_that_do_not_fit_are_read_in_every_step(scen
 
 def test_a_map_of_another_size_is_refused_with_the_command_for_the_wanted_size(scene):
     cli.cast(scene, max_image_size=40)
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with pytest.raises(
         SceneError, match=r"it is 40x27 pixels, the camera 24x16; run `shellgs cast .* --max-image-size 24`"
     ):

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from scenes import views_of
 from training_runs import Method, trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
 from shellgs_method.trainer import FacadeTrainer
 
@@ -19,7 +19,7 @@ HALVES = ("west", "east")
 
 def cut_in_two(scene: Path, overlap: float = 0.5) -> Blocks:
     """Cut a scene of ten photographs, of a walk out and back, in the middle of its length."""
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     first, farthest = (views[k].camera.position.numpy() for k in (0, 4))
     along = (farthest - first) / np.linalg.norm(farthest - first)
     cut = Cut((float(along[0]), float(along[1]), float(along[2])), float(along @ (first + farthest) / 2))

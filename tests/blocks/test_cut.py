@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import parse
+from scenes import parse, views_of
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, read_views, trainable_cells
+from dataparsers.facade import FacadeDataParserConfig, trainable_cells
 from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, assumed_metres, cut, tracked
 from shellgs_method.blocks.walls import Walls
 from shellgs_method.commands.blocks import blocks as command
@@ -227,7 +227,7 @@ def test_cuts_are_the_same_in_any_unit_where_metres_are_unknown(street: np.ndarr
 
 
 def test_metres_are_assumed_by_how_far_photographs_are_from_what_they_show(scene: Path):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     around = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 5.0], [-9.0, 0.0, 0.0]])
     shown = {view.name: view.camera.position.numpy() + around for view in views}
     assert assumed_metres(views, shown) == pytest.approx(2.0)

@@ -17,11 +17,10 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 from rich.progress import Progress
-from scenes import photograph
+from scenes import photograph, views_of
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.database import counting, tidy
 from shellgs_method.capture.lenses import group_by_lens
@@ -742,8 +741,8 @@ def captured(truth) -> Path:
 
 @pytest.mark.slow
 def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
-    true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
-    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=captured))}
+    true = {Path(view.name).name: view for view in views_of(truth)}
+    found = {Path(view.name).name: view for view in views_of(captured)}
     assert len(found) >= 22
     positions = np.stack([true[name].camera.position.numpy() for name in found])
     errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
@@ -782,7 +781,7 @@ def test_mapping_begins_with_the_focal_length_and_notices_a_tear(truth, captured
     command = [sys.executable, "-c", _MAPPING, script, work / "features/database.db", work / "model"]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     focal, whole, torn, is_in_the_middle = json.loads(printed.splitlines()[-1])
-    true = read_views(FacadeDataParserConfig(data=truth))[0].camera.K[0, 0].item()
+    true = views_of(truth)[0].camera.K[0, 0].item()
     assert focal == pytest.approx(true, rel=0.15)
     assert whole > 2 * CONFIRMED
     assert torn == 0
@@ -799,8 +798,8 @@ def test_two_passes_in_two_folders_are_one_model(truth, tmp_path):
         shutil.copy(truth / "images" / name, target)
     summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
     assert len(summary.registered) >= 22
-    true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
-    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    true = {Path(view.name).name: view for view in views_of(truth)}
+    found = {Path(view.name).name: view for view in views_of(tmp_path / "scene")}
     positions = np.stack([true[name].camera.position.numpy() for name in found])
     errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
     assert np.linalg.norm(errors, axis=1).max() < 0.05 * np.ptp(positions, axis=0).max()  # a bay is three times as much
@@ -824,7 +823,7 @@ def test_a_scene_captured_with_masks_loads_with_them(truth, tmp_path):
         mask[:, : mask.shape[1] // 8] = 0
         Image.fromarray(mask).save(tmp_path / "masks" / f"{path.name}.png")
     capture(truth / "images", tmp_path / "scene", CaptureConfig(masks=tmp_path / "masks"))
-    for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene", masks_path=Path("masks")))[:3]:
+    for view in views_of(tmp_path / "scene", masks_path=Path("masks"))[:3]:
         mask = load_mask(view)
         assert mask is not None
         assert mask.shape == load_photograph(view).shape[:2] == (view.camera.height, view.camera.width)

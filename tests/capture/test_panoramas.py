@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from scenes import photograph, write_video
+from scenes import photograph, views_of, write_video
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.panoramas import (
     FACES,
@@ -353,7 +352,7 @@ def test_panoramas_of_a_walk_are_found_where_they_were_taken(tmp_path):
     true = write_panoramas(tmp_path / "photographs", facade)
     summary = capture(tmp_path / "photographs", tmp_path / "scene")
     assert not summary.missing
-    views = {view.name: view.camera for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    views = {view.name: view.camera for view in views_of(tmp_path / "scene")}
     assert len(views) == 80
     front = np.stack([views[f"images/yaw000-pitch00/{k:02d}.jpg"].position.numpy() for k in range(10)])
     for prefix in FACES:

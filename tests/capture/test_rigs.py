@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scenes import photograph
+from scenes import photograph, views_of
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.errors import SceneError
@@ -85,7 +84,7 @@ def test_cameras_of_a_rig_are_mounted_as_they_were(tmp_path):
     write_walk(tmp_path / "photographs", is_mounted=True)
     summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(cameras="rig"))
     assert not summary.missing
-    views = {view.name: view.camera for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    views = {view.name: view.camera for view in views_of(tmp_path / "scene")}
     left, right = ([views[f"images/{side}/{k:02d}.png"] for k in range(12)] for side in ("left", "right"))
     for one, other in zip(left, right, strict=True):
         mounted = (other.viewmat @ one.viewmat.inverse()).numpy()

@@ -19,8 +19,8 @@ import open3d as o3d
 import psutil
 import pytest
 from PIL import Image
+from scenes import views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import MapRecord
 from shellgs_method.files.photographs import View
@@ -68,7 +68,7 @@ def training(scene: Path, steps: int, *more: object) -> list[object]:
 
 
 def cast(scene: Path) -> None:
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     cast_views(PlacedShell.load(scene, views, Alignment.load(scene / ALIGNMENT)))
 
 
@@ -114,7 +114,7 @@ def repeat(scene: Path) -> list[View]:
             os.link(scene / f"images/view_{k % PHOTOGRAPHS:04}.jpg", scene / name)
         frame["file_path"] = name
     path.write_text(json.dumps({**cameras, "frames": frames}))
-    return read_views(FacadeDataParserConfig(data=scene))
+    return views_of(scene)
 
 
 def repeat_maps(scene: Path, kind: str, views: Sequence[View]) -> None:

@@ -15,10 +15,11 @@ import open3d as o3d
 import pytest
 import torch
 from PIL import Image
+from scenes import views_of
 from scipy.spatial.transform import Rotation
 from training_runs import trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.cli import main
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as_disparity, fit_disparity
@@ -297,7 +298,7 @@ def test_a_distorted_photographs_map_is_undistorted_with_it(scene: Path, tmp_pat
     """Column numbers, stored as a map, come out where the undistorted photograph has those columns."""
     transforms = json.loads((scene / "transforms.json").read_text())
     (scene / "transforms.json").write_text(json.dumps(transforms | {"k1": 0.15}))
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     assert view.lens is not None
     focal, centre = transforms["fl_x"], (transforms["cx"], transforms["cy"])
     columns = np.broadcast_to(np.arange(transforms["w"]) + 0.5, (transforms["h"], transforms["w"]))
@@ -406,7 +407,7 @@ def depth_anything(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_depth_anything_is_loaded_by_its_own_package(depth_anything: Path, pristine_scene: Path):
-    view = read_views(FacadeDataParserConfig(data=pristine_scene))[0]
+    view = views_of(pristine_scene)[0]
     predictor = DepthAnything(str(depth_anything)).load()
     prediction = predictor.predict(view)
     assert prediction is not None
@@ -496,7 +497,7 @@ def test_moge_is_loaded_by_its_own_package(tmp_path: Path, pristine_scene: Path)
     }
     model = moge.MoGeModel(**config)
     torch.save({"model_config": config, "model": model.state_dict()}, tmp_path / "model.pt")
-    prediction = MoGe2(str(tmp_path)).load().predict(read_views(FacadeDataParserConfig(data=pristine_scene))[0])
+    prediction = MoGe2(str(tmp_path)).load().predict(views_of(pristine_scene)[0])
     assert prediction is not None
     assert prediction.normal is not None
     assert prediction.disparity.shape == (32, 48)
@@ -520,7 +521,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *words: 
 
 def truths(scene: Path) -> list[tuple[View, CueMap]]:
     maps = CueMaps.open(scene, "truth")
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     return [(view, cue) for view in views if (cue := maps.read(view.name, view.camera))]
 
 
@@ -672,7 +673,7 @@ def test_a_networks_disparity_is_aligned_to_the_points_of_each_view(
     scene: Path, depth_anything: Path, monkeypatch, capsys
 ):
     """From SfM points on surfaces that the random network predicts, its maps are these surfaces, view by view."""
-    views, predict = read_views(FacadeDataParserConfig(data=scene)), DepthAnything(str(depth_anything)).load().predict
+    views, predict = views_of(scene), DepthAnything(str(depth_anything)).load().predict
     rng, depths, points = np.random.default_rng(0), {}, []
     for number, view in enumerate(views):
         prediction = predict(view)

@@ -17,9 +17,9 @@ import laspy
 import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
-from scenes import parse, photograph, scan, write_colmap, write_video
+from scenes import parse, photograph, scan, views_of, write_colmap, write_video
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method import cli
 from shellgs_method.cues.maps import Fits
 from shellgs_method.errors import SceneError
@@ -191,7 +191,7 @@ def test_sfm_points_that_cannot_be_read_are_refused_in_a_sentence(scene, shellgs
 
 
 def model(scene: Path) -> Path:
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     return scene / "sparse" / "0"
 
 
@@ -406,7 +406,7 @@ def test_a_tiff_is_read_in_its_colours_or_refused_as_what_it_is(tmp_path):
     ],
 )
 def test_an_invalid_photograph_is_refused_by_name(scene, spoil, words):
-    view = read_views(FacadeDataParserConfig(data=scene))[1]
+    view = views_of(scene)[1]
     spoil(view.image)
     with pytest.raises(SceneError, match=words):
         load_photograph(view)
@@ -612,7 +612,7 @@ def test_a_source_that_is_not_a_file_is_never_read(scene):
     path = scene / "cues" / "shell" / "manifest.json"
     manifest = json.loads(path.read_text())
     path.write_text(json.dumps(manifest | {"sources": {"/dev/zero": "0", "/": "0"}}))
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with pytest.raises(SceneError, match=r"made from another /dev/zero and /"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
 
@@ -640,7 +640,7 @@ def test_a_record_of_wrong_types_is_refused_by_its_view(scene, fields):
         arrays = dict(file)
     record = np.array(json.dumps(json.loads(str(arrays.pop("record"))) | fields))
     np.savez(path, record=record, **arrays)
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with pytest.raises(SceneError, match=r"frame_00001.png.*is damaged.*run `shellgs cast"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
 
@@ -653,7 +653,7 @@ def test_an_array_that_claims_to_be_huge_is_not_allocated(scene):
     with zipfile.ZipFile(path, "w") as archive:
         for name, member in members.items():
             archive.writestr(name, member)
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with pytest.raises(SceneError, match=r"frame_00001.png.*its depth is float32 \[4000000, 4000000\]"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
 

@@ -18,10 +18,10 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import PHONE, parse, write_colmap
+from scenes import PHONE, parse, views_of, write_colmap
 
 from dataparsers.cameras import scene_to_world
-from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.dataset import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
@@ -44,10 +44,10 @@ def test_every_eighth_image_by_sorted_name_is_held_out_starting_with_the_first(p
 @pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
 def test_photographs_that_a_user_took_out_of_their_folder_are_left_out(shellgs, scene, kind, caplog):
     if kind == "COLMAP":
-        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        write_colmap(scene, views_of(scene), list(range(1, 11)))
         shutil.rmtree(scene / "cues")
         shellgs("cast", scene)
-    cameras = {view.name: view.camera.viewmat for view in read_views(FacadeDataParserConfig(data=scene))}
+    cameras = {view.name: view.camera.viewmat for view in views_of(scene)}
     before = parse(scene)
     for number in (4, 9):  # the latter is held out
         (scene / f"images/frame_{number:05d}.png").unlink()
@@ -56,7 +56,7 @@ def test_photographs_that_a_user_took_out_of_their_folder_are_left_out(shellgs, 
     assert names(after) == [name for name in names(before) if name != "frame_00004.png"]
     kept = [k for k, name in enumerate(names(before)) if name != "frame_00004.png"]
     torch.testing.assert_close(after.cameras.camera_to_worlds, before.cameras.camera_to_worlds[kept])
-    left = read_views(FacadeDataParserConfig(data=scene))
+    left = views_of(scene)
     assert [view.name for view in left] == [name for name in cameras if name[-9:] not in ("00004.png", "00009.png")]
     assert all((view.camera.viewmat == cameras[view.name]).all() for view in left)
     assert "2 of 10 images of the cameras" in caplog.text
@@ -76,15 +76,15 @@ def test_a_quarter_of_the_photographs_may_be_missing_and_not_all_of_a_split(scen
 
 
 def test_the_split_of_a_colmap_scene_follows_names_and_not_colmap_ids(scene):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     write_colmap(scene, views, ids=list(range(len(views), 0, -1)))
     assert names(parse(scene, "test")) == ["frame_00001.png", "frame_00009.png"]
 
 
 def test_colmap_and_transforms_json_give_the_same_cameras(scene):
-    before = read_views(FacadeDataParserConfig(data=scene))
+    before = views_of(scene)
     write_colmap(scene, before, ids=list(range(1, len(before) + 1)))
-    after = read_views(FacadeDataParserConfig(data=scene))
+    after = views_of(scene)
     for one, other in zip(before, after, strict=True):
         torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, atol=1e-5, rtol=0)
         torch.testing.assert_close(one.camera.K, other.camera.K)
@@ -96,7 +96,7 @@ def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, meth
     """So that earlier runs, and other methods, have the same cameras and points."""
     common = {"data": scene, "downscale_factor": 1, "load_3D_points": True, **method}
     if kind == "COLMAP":
-        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        write_colmap(scene, views_of(scene), list(range(1, 11)))
         config = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all", **common)
     else:
         transforms = json.loads((scene / "transforms.json").read_text())
@@ -118,7 +118,7 @@ def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, meth
 @pytest.mark.parametrize("method", ["pca", "up", "vertical", "none"])
 def test_cameras_are_moved_to_the_rescaled_world_as_points_are(scene, method):
     """Nerfstudio's pca turns the points of this scene over, and of the cameras the second and third alone."""
-    before = read_views(FacadeDataParserConfig(data=scene))
+    before = views_of(scene)
     outputs = parse(scene, orientation_method=method)
     world = scene_to_world(outputs)
     motion = np.vstack([outputs.dataparser_transform.double().numpy(), [0, 0, 0, 1]])
@@ -168,7 +168,7 @@ def test_an_angle_of_view_is_a_focal_length(scene, smaller):
     """As in NeRF's synthetic scenes, which say nothing else of the lens, and name photographs without a suffix."""
     path = scene / "transforms.json"
     meta = json.loads(path.read_text())
-    before = read_views(FacadeDataParserConfig(data=scene))
+    before = views_of(scene)
     angle = 2 * np.arctan(meta["w"] / 2 / meta["fl_x"])
     frames = [{**each, "file_path": f"./{each['file_path'].removesuffix('.png')}"} for each in meta["frames"]]
     if smaller:  # as of a data set that is scaled down, with the size that it had
@@ -177,7 +177,7 @@ def test_an_angle_of_view_is_a_focal_length(scene, smaller):
                 image.resize((meta["w"] // 2, meta["h"] // 2)).save(scene / each["file_path"])
     size = {"w": meta["w"], "h": meta["h"]} if smaller else {}
     path.write_text(json.dumps({"camera_angle_x": angle, **size, "frames": frames}))
-    for view, same in zip(read_views(FacadeDataParserConfig(data=scene)), before, strict=True):
+    for view, same in zip(views_of(scene), before, strict=True):
         camera = same.camera.scaled(0.5) if smaller else same.camera
         assert (view.name, view.camera.width, view.camera.height) == (same.name, camera.width, camera.height)
         torch.testing.assert_close(view.camera.K, camera.K)
@@ -199,7 +199,7 @@ def test_points_where_others_are_are_left_out(scene, caplog, kind):
     expected = read_sparse_points(FacadeDataParserConfig(data=scene)).positions
     np.testing.assert_allclose(expected, [[float(x) for x in place.split()] for place in places])
     if kind == "COLMAP":
-        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        write_colmap(scene, views_of(scene), list(range(1, 11)))
         points = [f"{k} {place} 9 9 9 0 1 0\n" for k, place in enumerate([*places, *places[1:2] * 3], start=1)]
         (scene / "sparse/0/points3D.txt").write_text("".join(points))
         found = read_sparse_points(FacadeDataParserConfig(data=scene))
@@ -240,7 +240,7 @@ def test_points_that_are_all_in_one_place_are_refused(scene):
 def test_black_points_are_grey_and_told(scene, caplog, kind):
     """As where colours were not extracted: a black Gaussian would get no gradient."""
     if kind == "COLMAP":
-        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        write_colmap(scene, views_of(scene), list(range(1, 11)))
         points = scene / "sparse/0/points3D.txt"
         points.write_text(points.read_text().replace(" 9 9 9 ", " 0 0 0 "))
     else:
@@ -257,7 +257,7 @@ def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given
     meta |= {"k1": 0.0, "k2": 0.01} if given == "k1" else {given: [0.0, 0.01, 0, 0, 0, 0]}
     meta["frames"][1] |= {"fl_x": 1.5 * meta["fl_x"], "k1": -0.1}
     path.write_text(json.dumps(meta))
-    first, second = read_views(FacadeDataParserConfig(data=scene))[:2]
+    first, second = views_of(scene)[:2]
     assert first.lens is not None
     assert second.lens is not None
     assert float(second.lens.K[0, 0]) == 1.5 * float(first.lens.K[0, 0])
@@ -268,11 +268,11 @@ def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given
 
 def test_null_in_a_camera_says_nothing(scene):
     path = scene / "transforms.json"
-    before, meta = read_views(FacadeDataParserConfig(data=scene))[0], json.loads(path.read_text())
+    before, meta = views_of(scene)[0], json.loads(path.read_text())
     nothing = dict.fromkeys(("k1", "k4", "p1", "distortion_params", "camera_model", "fl_x", "mask_path"))
     meta["frames"] = [each | nothing for each in meta["frames"]]
     path.write_text(json.dumps(meta | {"k2": None}))
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     assert (view.lens, view.mask) == (None, None)
     torch.testing.assert_close(view.camera.K, before.camera.K)
 
@@ -289,7 +289,7 @@ def test_photographs_of_nearly_their_cameras_size_are_told_of(scene, caplog, siz
         frame |= {"w": size[0], "h": size[1], "cx": size[0] / 2, "cy": size[1] / 2, "fl_x": size[0], "fl_y": size[0]}
     meta["frames"] = frames[:2]
     path.write_text(json.dumps(meta))
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     assert ("2 photographs of" in caplog.text and "not quite: images/frame_00001.png is" in caplog.text) == told
 
 
@@ -305,10 +305,10 @@ COLOURS: dict[str, tuple[tuple[str, ...], str, float]] = {
 
 def test_an_applied_scale_is_told_and_changes_no_camera(scene, caplog):
     path = scene / "transforms.json"
-    transforms, before = json.loads(path.read_text()), read_views(FacadeDataParserConfig(data=scene))
+    transforms, before = json.loads(path.read_text()), views_of(scene)
     for scale in (1.0, 0.5):
         path.write_text(json.dumps(transforms | {"applied_scale": scale}))
-        after = read_views(FacadeDataParserConfig(data=scene))
+        after = views_of(scene)
         assert ("has an applied_scale of 0.5, which is not undone" in caplog.text) == (scale != 1)
         assert [view.camera.viewmat.tolist() for view in after] == [view.camera.viewmat.tolist() for view in before]
 
@@ -321,7 +321,7 @@ def test_p1_and_p2_of_metashape_are_told_where_pixels_show_them_exchanged(scene,
     for frame in meta["frames"]:
         frame["transform_matrix"] = (applied @ frame["transform_matrix"]).tolist()
     path.write_text(json.dumps(meta | {"applied_transform": applied[:3].tolist(), "p1": p1, "p2": p2}))
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     x, y = meta["w"] / 2 / meta["fl_x"] * np.array([-1, 1]), -meta["h"] / 2 / meta["fl_x"]
     along_x, along_y, across = 3 * x**2 + y**2, x**2 + 3 * y**2, 2 * x * y
     in_metashape = np.stack([p1 * along_x + p2 * across, p2 * along_y + p1 * across])
@@ -339,7 +339,7 @@ def test_principal_points_of_opendronemap_are_read_in_pixels(scene, caplog):
     (scene / meta["ply_file_path"]).rename(scene / "reconstruction.ply")
     shares = {"cx": (meta["w"] - 1) / 2 + 0.01, "cy": (meta["h"] - 1) / 2 - 0.004}
     path.write_text(json.dumps(meta | shares | {"ply_file_path": "reconstruction.ply"}))
-    camera = read_views(FacadeDataParserConfig(data=scene))[0].camera
+    camera = views_of(scene)[0].camera
     assert camera.K[0, 2] == pytest.approx(meta["w"] / 2 + 0.01 * meta["w"])
     assert camera.K[1, 2] == pytest.approx(meta["h"] / 2 - 0.004 * meta["w"])
     assert "OpenDroneMap's principal points" in caplog.text
@@ -407,7 +407,7 @@ def test_splats_of_other_programs_are_points_too(scene, names, order, more):
 
 def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):
     frames = {f["file_path"]: f for f in json.loads((pristine_scene / "transforms.json").read_text())["frames"]}
-    for view in read_views(FacadeDataParserConfig(data=pristine_scene)):
+    for view in views_of(pristine_scene):
         pose = torch.tensor(frames[view.name]["transform_matrix"], dtype=torch.float64)
         opencv = pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
         torch.testing.assert_close(view.camera.viewmat @ opencv, torch.eye(4, dtype=torch.float64), atol=1e-5, rtol=0)
@@ -509,9 +509,9 @@ def test_metres_per_unit_are_those_of_the_rescaled_world(pristine_scene):
 
 def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_image(scene):
     """A straight line of the world, bent by the lens, is straight again in the undistorted photograph."""
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     write_colmap(scene, views, list(range(1, 11)), model="OPENCV", extra="-0.2 0.05 0 0")
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     K = view.camera.K.numpy()
     assert view.lens is not None
     calibrated = view.lens.K.numpy()
@@ -583,7 +583,7 @@ def turn_cameras(scene: Path) -> None:
 def with_heights_as_colours(scene: Path) -> None:
     """Points darker at the top than below, and photographs the other way round."""
     cloud: Any = trimesh.load(scene / "sparse_pc.ply")
-    heights = cloud.vertices @ image_up(view.camera for view in read_views(FacadeDataParserConfig(data=scene)))
+    heights = cloud.vertices @ image_up(view.camera for view in views_of(scene))
     grey = (255 * (heights.max() - heights) / np.ptp(heights)).astype(np.uint8)
     trimesh.PointCloud(cloud.vertices, np.repeat(grey[:, None], 3, axis=1)).export(scene / "sparse_pc.ply")
     for path in (scene / "images").iterdir():
@@ -604,7 +604,7 @@ def without_points(scene: Path) -> None:
 
 
 def differences(scene: Path, upright: dict[str, np.ndarray]) -> list[float]:
-    views = [view for view in read_views(FacadeDataParserConfig(data=scene)) if view.image.stem in upright]
+    views = [view for view in views_of(scene) if view.image.stem in upright]
     return [np.abs(load_photograph(view).astype(float) - upright[view.image.stem]).mean() for view in views]
 
 
@@ -664,7 +664,7 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_the_sha
 def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog, cloud):
     cloud(scene)
     store_turned(scene, 3)
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     assert "nothing tells whether their cameras are of the upright ones" in caplog.text
 
 
@@ -716,10 +716,10 @@ def test_missing_images_are_refused_by_name(scene):
 
 
 def test_a_list_of_photographs_that_is_not_text_is_refused_by_name(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     (scene / "test_list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match=r"test_list.txt is not a text file"):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)
 
 
 # Models: all photographs are read, and what is not is said
@@ -749,18 +749,18 @@ def with_keypoints(lines: list[str]) -> list[str]:
     ids=["no blank lines", "some keypoints", "doubled", "byte-order mark", "blanks in a name", "a name of numbers"],
 )
 def test_all_images_of_a_text_model_are_read_whatever_became_of_its_empty_lines(scene, change):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     path = scene / "sparse" / "0" / "images.txt"
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n", "utf-8")
     for name in ("fasade 1 2.png", "1 2 3"):
         if name in path.read_text("utf-8"):
             (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
-    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(views_of(scene)) == 10
 
 
 def split_model(scene: Path, place: str, counts: dict[str, int]) -> None:
     """Models of the first photographs of a scene, in numbered folders."""
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     write_colmap(scene, views, list(range(1, len(views) + 1)))
     whole = (scene / "sparse" / "0").rename(scene / "whole")
     lines = (whole / "images.txt").read_text().splitlines()
@@ -775,19 +775,19 @@ def split_model(scene: Path, place: str, counts: dict[str, int]) -> None:
 def test_of_several_colmap_models_the_largest_is_read_and_named(scene, caplog, place, counts):
     split_model(scene, place, counts)
     largest = next(number for number, count in counts.items() if count == 7)
-    assert len(read_views(FacadeDataParserConfig(data=scene))) == 7
+    assert len(views_of(scene)) == 7
     assert (f"{place}/{largest}, the largest, is used, with 7 photographs" in caplog.text) == (len(counts) > 1)
     assert FacadeDataParserConfig(data=scene, colmap_path=Path(place)).colmap_folder() == Path(place, largest)
 
 
 def test_a_colmap_model_may_be_in_the_scene_folder_itself(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     for path in (scene / "sparse" / "0").iterdir():
         path.rename(scene / path.name)
-    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(views_of(scene)) == 10
     shutil.copytree(scene / "images", scene, dirs_exist_ok=True)
     shutil.rmtree(scene / "images")
-    assert read_views(FacadeDataParserConfig(data=scene))[0].name == "frame_00001.png"
+    assert views_of(scene)[0].name == "frame_00001.png"
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -807,41 +807,41 @@ def test_photographs_with_the_same_black_borders_are_told(scene, masked, caplog)
 
 
 def test_a_text_model_may_have_other_letters_in_its_names_and_windows_encoding(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     for name, other in (("cameras", "Cameras.TXT"), ("images", "images.txt"), ("points3D", "points3d.txt")):
         path = scene / "sparse" / "0" / f"{name}.txt"
         text = path.read_text()
         path.unlink()
         path.with_name(other).write_text(text, "utf-16")
-    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(views_of(scene)) == 10
     assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
 
 
 def test_of_files_of_a_model_whose_names_differ_in_letters_colmaps_own_is_read(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     for other in ("Cameras.txt", "Images.txt", "points3d.txt", "Points3D.txt"):
         (scene / "sparse" / "0" / other).write_text("# of another program\n")
-    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    assert len(views_of(scene)) == 10
     assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
 
 
 def test_whole_numbers_of_a_text_model_may_have_decimals(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     for name, old, new in (("cameras", " 48 32 ", " 48.0 32.0 "), ("points3D", " 9 9 9 ", " 9.0 9.0 9.0 ")):
         path = scene / "sparse" / "0" / f"{name}.txt"
         path.write_text(path.read_text().replace(old, new))
-    assert read_views(FacadeDataParserConfig(data=scene))[0].camera.width == 48
+    assert views_of(scene)[0].camera.width == 48
     assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
 
 
 def test_a_chosen_colmap_model_is_read_though_another_is_larger(scene):
     split_model(scene, "sparse", {"0": 2, "1": 7})
-    assert len(read_views(FacadeDataParserConfig(data=scene, colmap_path=Path("sparse/0")))) == 2
+    assert len(views_of(scene, colmap_path=Path("sparse/0"))) == 2
 
 
 @pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
 def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     assert "left out" not in caplog.text
     if kind == "transforms.json":
         transforms = json.loads((scene / "transforms.json").read_text())
@@ -852,7 +852,7 @@ def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
     (scene / "images" / "more").mkdir()
     shutil.copy(views[0].image, scene / "images" / "more" / "IMG_1.JPG")
     (scene / "images" / "notes.txt").touch()
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     assert "4 of 11 photographs of" in caplog.text
     assert "left out: images/frame_00008.png, images/frame_00009.png, images/frame_00010.png, …" in caplog.text
 
@@ -924,9 +924,9 @@ SPELLINGS: dict[str, Callable[[str], str]] = {
 
 @pytest.mark.parametrize("spelling", SPELLINGS)
 def test_photographs_are_found_however_their_paths_are_written(scene, spelling):
-    before = read_views(FacadeDataParserConfig(data=scene))
+    before = views_of(scene)
     respell(scene, SPELLINGS[spelling])
-    after = read_views(FacadeDataParserConfig(data=scene))
+    after = views_of(scene)
     assert [(view.name, view.image) for view in after] == [(view.name, view.image) for view in before]
 
 
@@ -934,13 +934,13 @@ def test_paths_of_which_letters_are_composed_otherwise_are_found(scene):
     name = unicodedata.normalize("NFD", "façade.png")  # as macOS writes it
     (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
     respell(scene, lambda path: path.replace("frame_00001", "façade"))
-    assert read_views(FacadeDataParserConfig(data=scene))[0].image.name == name
+    assert views_of(scene)[0].image.name == name
 
 
 @pytest.mark.parametrize(("name", "page"), [("Südfassade", "cp1252"), ("照片", "gbk"), ("фасад", "cp1251")])
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
 def test_names_in_the_code_page_of_the_machine_are_found(scene, caplog, name, page, suffix):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     folder = scene / "sparse" / "0"
     path = folder / "images.txt"
     path.write_bytes(path.read_bytes().replace(b"frame_00001", name.encode(page)))
@@ -948,17 +948,17 @@ def test_names_in_the_code_page_of_the_machine_are_found(scene, caplog, name, pa
         read = colmap.read_model(folder)
         colmap.write_model(scene / "colmap" / "sparse" / "0", read, np.zeros(len(read.points.ids)))
     (scene / "images" / "frame_00001.png").rename(scene / "images" / f"{name}.png")
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     assert [view.name for view in views].count(f"images/{name}.png") == 1
     assert f"is images/{name}.png, for example" in caplog.text
     (scene / "images" / f"{name}.png").unlink()
     with pytest.raises(SceneError, match="whose letters are not UTF-8, and none here fits: use plain letters"):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)
 
 
 def test_photographs_found_elsewhere_are_told(scene, caplog):
     respell(scene, SPELLINGS["other machine"])
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     assert "10 of the files that" in caplog.text
     assert "/home/ann/shoot/images/frame_00001.png is images/frame_00001.png" in caplog.text
 
@@ -969,14 +969,14 @@ def test_a_path_that_fits_two_photographs_is_refused(scene):
     with pytest.raises(
         SceneError, match=r"frame 4 names the file 'images/frame_00004', which may be .*4.jpg or .*4.png"
     ):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)
 
 
 def test_a_deleted_photograph_is_not_taken_from_another_folder(scene, caplog):
     (scene / "images" / "left").mkdir()
     shutil.copy(scene / "images" / "frame_00001.png", scene / "images" / "left" / "a.png")
     respell(scene, lambda path: path.replace("images/frame_00001", "images/left/frame_00002"))
-    assert "images/left/frame_00002.png" not in [view.name for view in read_views(FacadeDataParserConfig(data=scene))]
+    assert "images/left/frame_00002.png" not in [view.name for view in views_of(scene)]
     assert "are not on disk, and are left out: images/left/frame_00002.png." in caplog.text
 
 
@@ -989,14 +989,14 @@ def test_masks_and_points_are_found_however_their_paths_are_written(scene):
     before = parse(scene).metadata["points3D_xyz"]
     (scene / "transforms.json").write_text(json.dumps(transforms))
     torch.testing.assert_close(parse(scene).metadata["points3D_xyz"], before)
-    assert read_views(FacadeDataParserConfig(data=scene))[0].mask == scene / "mask.png"
+    assert views_of(scene)[0].mask == scene / "mask.png"
 
 
 def test_colmap_names_that_begin_with_the_folder_of_the_photographs_keep_their_points(scene):
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     path = scene / "sparse" / "0" / "images.txt"
     path.write_text(path.read_text().replace(" frame_", " images/frame_"))
-    assert read_views(FacadeDataParserConfig(data=scene))[0].name == "images/frame_00001.png"
+    assert views_of(scene)[0].name == "images/frame_00001.png"
     observed = read_sparse_points(FacadeDataParserConfig(data=scene)).observed
     assert observed is not None
     assert len(observed["images/frame_00001.png"]) == 39

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scenes import views_of
 from training_runs import data_of, model_of, trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import CueMap
@@ -19,7 +19,7 @@ WIDTH = 2 * UNITS_PER_METRE  # width of a band, in scene units
 
 @pytest.fixture(scope="module")
 def views(pristine_scene) -> list[View]:
-    return read_views(FacadeDataParserConfig(data=pristine_scene))
+    return views_of(pristine_scene)
 
 
 @pytest.fixture(scope="module")

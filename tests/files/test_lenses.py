@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import write_colmap
+from scenes import views_of, write_colmap
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
@@ -32,7 +31,7 @@ def with_lens(scene: Path, model: str, coefficients: dict[str, float]) -> list[V
         for key in (*lens, "k1", "k2", "p1", "p2"):
             frame.pop(key, None)
     (scene / "transforms.json").write_text(json.dumps(transforms))
-    return read_views(FacadeDataParserConfig(data=scene))
+    return views_of(scene)
 
 
 def rays_through(model: str, coefficients: dict[str, float]) -> np.ndarray:
@@ -67,7 +66,7 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     depth = caster.triangles.cast_rays(rays).t
     shade = np.where(np.isfinite(depth), 40 + 200 * np.clip(depth / 25, 0, 1), 0).astype(np.uint8)
     Image.fromarray(np.repeat(shade[..., None], 3, axis=2)).save(view.image)
-    view = read_views(FacadeDataParserConfig(data=scene))[4]  # whose size is that of its photograph
+    view = views_of(scene)[4]  # whose size is that of its photograph
     photograph = load_photograph(view)[..., 0].astype(float)
     cue = caster.cast(view.camera)
     assert photograph.shape == cue.mask.shape
@@ -85,19 +84,19 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     ("model", "coefficients"), [("OPENCV_FISHEYE", (0.08, -0.03, 0.01, 0.004)), ("FISHEYE", (0, 0, 0, 0))]
 )
 def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path, model: str, coefficients: tuple[float, ...]):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     extra = " ".join(map(str, coefficients)) if any(coefficients) else ""
     write_colmap(scene, views, list(range(1, 11)), model=model, extra=extra)
-    lens = read_views(FacadeDataParserConfig(data=scene))[0].lens
+    lens = views_of(scene)[0].lens
     assert lens is not None
     assert lens.fisheye
     assert lens.distortion == (*coefficients, 0, 0)
 
 
 def test_a_full_opencv_model_without_a_denominator_is_browns(scene: Path):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     write_colmap(scene, views, list(range(1, 11)), model="FULL_OPENCV", extra="-0.2 0.05 0.004 -0.003 0.02 0 0 0")
-    lens = read_views(FacadeDataParserConfig(data=scene))[0].lens
+    lens = views_of(scene)[0].lens
     assert lens is not None
     assert not lens.fisheye
     assert lens.distortion == (-0.2, 0.05, 0.02, 0, 0.004, -0.003)
@@ -183,7 +182,7 @@ def test_what_moves_the_edges_is_refused_unless_it_is_less_than_cameras_are_off(
     [("FULL_OPENCV", "0.1 0 0 0 0 0.2 0 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
 )
 def test_a_colmap_model_unknown_to_nerfstudio_is_refused(scene: Path, model: str, extra: str):
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     write_colmap(scene, views, list(range(1, 11)), model=model, extra=extra)
     with pytest.raises(SceneError, match=rf"{re.escape(str(scene))} are of the model {model}, which.*undistort"):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scenes import parse, write_colmap
+from scenes import parse, views_of, write_colmap
 from training_runs import data_of, held_out, model_of, trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -46,9 +46,9 @@ def paint_all(scene: Path, name: str = "masks/{stem}.png") -> None:
 @pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
 def test_masks_in_their_folder_are_found_without_a_flag(scene, kind, name):
     if kind == "COLMAP":
-        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        write_colmap(scene, views_of(scene), list(range(1, 11)))
     paint_all(scene, name)
-    for view in [*read_views(FacadeDataParserConfig(data=scene)), *parse(scene).metadata["views"]]:
+    for view in [*views_of(scene), *parse(scene).metadata["views"]]:
         kept = load_mask(view)
         assert kept is not None
         assert not kept[:, :12].any()
@@ -77,7 +77,7 @@ def test_a_folder_with_links_to_it_is_found_by_its_own_path(tmp_path):
 
 def test_a_photograph_without_a_mask_is_kept_whole_and_counted(scene, caplog):
     paint(scene / "masks" / "frame_00002.png", left=12)
-    masks = [view.mask is not None for view in read_views(FacadeDataParserConfig(data=scene))]
+    masks = [view.mask is not None for view in views_of(scene)]
     assert masks == [False, True, *[False] * 8]
     assert "9 of 10 photographs have no mask in" in caplog.text
 
@@ -100,7 +100,7 @@ def test_photographs_of_one_stem_that_share_a_mask_are_told(tmp_path, caplog):
 def test_masks_that_belong_to_no_photograph_are_counted(scene, caplog):
     paint_all(scene)
     (scene / "masks" / "frame_00003.png").rename(scene / "masks" / "frame_0003.png")
-    read_views(FacadeDataParserConfig(data=scene))
+    views_of(scene)
     assert "1 of 10 photographs have no mask" in caplog.text
     assert "1 files there belong to no photograph, frame_0003.png for example" in caplog.text
 
@@ -209,7 +209,7 @@ def test_a_mask_that_may_mean_several_things_is_refused(kind):
 )
 def test_masks_of_the_usual_names_are_found(scene, name):
     paint_all(scene, f"masks/{name}")
-    assert all(view.mask for view in read_views(FacadeDataParserConfig(data=scene)))
+    assert all(view.mask for view in views_of(scene))
 
 
 # Photographs with an alpha channel
@@ -228,7 +228,7 @@ def make_transparent(scene: Path, hidden: tuple[int, int, int] = (255, 0, 255), 
 def test_transparent_pixels_are_masked_and_their_colours_gone(scene, lens):
     transforms = json.loads((scene / "transforms.json").read_text()) | lens
     (scene / "transforms.json").write_text(json.dumps(transforms))
-    view = read_views(FacadeDataParserConfig(data=scene))[3]
+    view = views_of(scene)[3]
     opaque = load_photograph(view)
     assert load_mask(view) is None
     make_transparent(scene)
@@ -259,14 +259,14 @@ def test_a_photographs_mask_and_alpha_channel_both_count(scene):
     (scene / "masks").mkdir()
     for path in scene.glob("frame_*.png"):
         path.rename(scene / "masks" / path.name)
-    kept = load_mask(read_views(FacadeDataParserConfig(data=scene))[0])
+    kept = load_mask(views_of(scene)[0])
     assert kept is not None
     assert (kept == ((np.arange(48) >= 12) & (np.arange(48) < 40))).all()
 
 
 @pytest.mark.parametrize("alpha", [255, 128])
 def test_an_alpha_channel_that_hides_nothing_is_no_mask(scene, alpha):
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with Image.open(view.image) as image:
         image.putalpha(alpha)
         image.save(view.image)
@@ -275,7 +275,7 @@ def test_an_alpha_channel_that_hides_nothing_is_no_mask(scene, alpha):
 
 def test_a_photograph_that_is_transparent_everywhere_is_refused_by_name(scene):
     make_transparent(scene, left=48)
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     for load in (load_mask, load_photograph):
         with pytest.raises(SceneError, match=r"frame_00001.png is transparent everywhere: remove its alpha channel"):
             load(view)
@@ -301,7 +301,7 @@ def test_hidden_colours_change_nothing_in_the_check(scene):
         maps = CueMaps.open(scene, "checked")
         return np.stack([maps.require(view.name, view.camera).depth for view in views])
 
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     one, other = checked((255, 0, 255)), checked((0, 255, 0))
     np.testing.assert_array_equal(one, other)
     assert not one[:, :, :12].any()
@@ -311,21 +311,21 @@ def test_hidden_colours_change_nothing_in_the_check(scene):
 def test_inverse_masks_are_refused_with_how_they_differ(scene):
     paint_all(scene, "masks/dynamic_mask_{stem}.png")
     with pytest.raises(SceneError, match=r"no photograph has a mask.*invert \(the white of dynamic_mask_"):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)
 
 
 def test_masks_of_no_photograph_are_refused(scene):
     paint(scene / "masks" / "elsewhere.png", left=12)
     with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; rename the masks"):
-        read_views(FacadeDataParserConfig(data=scene))
+        views_of(scene)
     with pytest.raises(FileNotFoundError, match="painted is not a folder of masks"):
-        read_views(FacadeDataParserConfig(data=scene, masks_path=Path("painted")))
+        views_of(scene, masks_path=Path("painted"))
 
 
 def test_cast_leaves_masked_pixels_out_and_notices_changed_masks(scene):
     paint_all(scene)
     cli.cast(scene)
-    maps, view = CueMaps.open(scene, "shell"), read_views(FacadeDataParserConfig(data=scene))[4]
+    maps, view = CueMaps.open(scene, "shell"), views_of(scene)[4]
     cue = maps.read(view.name, view.camera)
     assert cue is not None
     assert not cue.mask[:, :12].any()
@@ -350,7 +350,7 @@ def test_align_validates_with_what_masks_keep(scene):
 def test_a_mask_of_another_shape_is_refused_by_its_own_name(scene):
     paint(scene / "masks" / "frame_00002.png", left=12, size=(48, 48))
     with pytest.raises(SceneError, match=r"the mask .*masks/frame_00002.png is 48x48 pixels.*is 48x32"):
-        load_mask(read_views(FacadeDataParserConfig(data=scene))[1])
+        load_mask(views_of(scene)[1])
 
 
 def test_masked_pixels_are_in_no_image_metric(monkeypatch):

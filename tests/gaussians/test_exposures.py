@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import views_of
 from training_runs import data_of, model_of, render, trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import measure
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.gaussians.exposures import Exposures
@@ -36,7 +36,7 @@ def learned(config) -> None:
 def changing(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene with another exposure and white balance in each photograph."""
     scene = Path(shutil.copytree(pristine_scene, tmp_path_factory.mktemp("changing") / "scene"))
-    for view, gain in zip(read_views(FacadeDataParserConfig(data=scene)), GAINS, strict=True):
+    for view, gain in zip(views_of(scene), GAINS, strict=True):
         image = torch.from_numpy(np.array(Image.open(view.image))) / 255
         image = exposed(image, torch.from_numpy(gain).float()).clamp(0, 1)
         Image.fromarray((255 * image).round().byte().numpy()).save(view.image)

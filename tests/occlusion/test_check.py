@@ -14,6 +14,7 @@ import torch
 import trimesh
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
+from scenes import views_of
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -500,7 +501,7 @@ def test_photographs_larger_than_the_maps_are_compared_at_their_own_size(shellgs
 
     monkeypatch.setattr(checking, "sweep", noting)
     shellgs("cast", scene, "--max-image-size", 24)
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     assert sizes == {view.camera.width}
     assert CueMaps.open(scene, "checked").require(view.name, view.camera.shrunk(24)).depth.shape[1] == 24
 
@@ -762,7 +763,7 @@ def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scen
     """Places at the cameras' positions, which nerfstudio transforms to its own world."""
     scene = tmp_path / "scene"
     shutil.copytree(pristine_scene, scene)
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     (scene / CONTRADICTED_PLACES).parent.mkdir(parents=True)
     places, red = positions(view.camera for view in views), np.full((len(views), 3), [255, 0, 0], np.uint8)
     trimesh.PointCloud(places, red).export(scene / CONTRADICTED_PLACES)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenes import views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.similarity import transformed
@@ -77,7 +77,7 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
     scene = tmp_path / "scene"
     write_scene(scene, FacadeConfig(width=480, height=270, views=24, points=300, supersampling=1))
     truth = Alignment.load(scene / ALIGNMENT)
-    views, vertices = read_views(FacadeDataParserConfig(data=scene)), load_shell(scene / truth.shells[0]).vertices
+    views, vertices = views_of(scene), load_shell(scene / truth.shells[0]).vertices
     windows, corners = Layout(6, 3).openings, []
     for bay, storey, corner in CORNERS:
         window = windows[6 * storey + bay]
@@ -114,7 +114,7 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
 
 
 def test_the_mouse_turns_zooms_sets_removes_and_undoes(scene: Path, browser: Any):
-    views, shell = read_views(FacadeDataParserConfig(data=scene)), scene / "shell/facade.ply"
+    views, shell = views_of(scene), scene / "shell/facade.ply"
     picks = scene / "picks.txt"
     session, scan = Session(picks, views), Scan([shell], ShellPlace(shell))
     with PickServer(0) as server:

@@ -18,8 +18,8 @@ from urllib.error import HTTPError, URLError
 import numpy as np
 import pytest
 from PIL import Image
+from scenes import views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import project
 from shellgs_method.picking.scan import Scan
@@ -64,7 +64,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def server(scene: Path) -> Iterator[PickServer]:
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     shell = scene / "shell/facade.ply"
     session, scan = Session(scene / "picks.txt", views), Scan([shell], ShellPlace(shell))
     with PickServer(0) as server:
@@ -76,7 +76,7 @@ def server(scene: Path) -> Iterator[PickServer]:
 
 def clicked(url: str, scene: Path, count: int = 4) -> None:
     """Pick vertices of the shell that two views see: by rays in the scan, and where they are in the photographs."""
-    alignment, views = Alignment.load(scene / ALIGNMENT), read_views(FacadeDataParserConfig(data=scene))
+    alignment, views = Alignment.load(scene / ALIGNMENT), views_of(scene)
     vertices = load_shell(scene / "shell/facade.ply").vertices
     middle = ShellPlace(scene / "shell/facade.ply").middle
     eye = np.linalg.solve(alignment.shell_to_scene, [*views[4].camera.position.tolist(), 1.0])[:3]

@@ -17,10 +17,9 @@ import pytest
 import torch
 import trimesh
 from PIL import ExifTags, Image
-from scenes import cast, write_colmap
+from scenes import cast, views_of, write_colmap
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture.sources import find_photographs
 from shellgs_method.commands import cast as casting
 from shellgs_method.errors import SceneError
@@ -327,7 +326,7 @@ def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_pat
     (scene / ALIGNMENT).unlink()
     one = shell(Layout(3, 2))
     write_scan(scan, merge([one, replace(one, vertices=one.vertices + np.array([40.0, 0, 0]))]))
-    views = scene_views(scene)
+    views = views_of(scene)
     for view, exif in zip(views, geo_tags(views, 3.0), strict=True):
         Image.open(view.image).save(view.image, exif=exif)
     told = shellgs("align", scene, scan, "--crs", "EPSG:25832")
@@ -1111,7 +1110,7 @@ def pick_corners(scene: Path, scaled: Sequence[float] = (1, 1, 1), moved: int = 
     on_shell = transformed(building, SHELL_FROM_BUILDING) * scaled
     on_shell[:moved] += np.random.default_rng(0).normal(0, 3, (moved, 3))
     lines = []
-    for view in read_views(FacadeDataParserConfig(data=scene)):
+    for view in views_of(scene):
         projection = (view.camera.K @ view.camera.viewmat[:3]).numpy()
         for k, point in enumerate(transformed(building, SCENE_FROM_BUILDING)):
             x, y, z = projection @ np.append(point, 1)
@@ -1153,7 +1152,7 @@ def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
 def test_camera_positions_give_the_alignment_and_name_missing_photographs(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     lines = ["EPSG:25832", "IMG_0001.jpg 0 0 0"]
-    for k, view in enumerate(read_views(FacadeDataParserConfig(data=scene))):
+    for k, view in enumerate(views_of(scene)):
         position = transformed(view.camera.position.double().numpy(), np.linalg.inv(true.shell_to_scene))
         position[0] += 2.0 if k == 3 else 0.0
         lines.append(f"{Path(view.name).name} {' '.join(map(str, position))}")
@@ -1199,7 +1198,7 @@ def test_validating_a_cast_alignment_writes_its_metrics_and_the_maps_error(scene
     assert validated.places_like(before)
     maps = CueMaps.open(scene, "shell")
     assert maps.manifest.error == validated.error is not None
-    for view in read_views(FacadeDataParserConfig(data=scene)):
+    for view in views_of(scene):
         assert maps.read(view.name, view.camera) is not None
     assert "0 views cast, 10 already there" in shellgs("cast", scene)
 
@@ -1209,7 +1208,7 @@ def test_another_alignment_makes_the_maps_stale(scene, shellgs):
     moved[0, 3] += 0.01
     np.save(scene / "matrix.npy", moved)
     assert "Written" in shellgs("align", scene, scene / "shell" / "facade.ply", "--matrix", scene / "matrix.npy")
-    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    view = views_of(scene)[0]
     with pytest.raises(SceneError, match=r"shell/alignment.json has changed since; run `shellgs cast"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
 
@@ -1224,10 +1223,6 @@ def move_cameras(scene: Path, motion: np.ndarray, digits: int = 17) -> None:
     (scene / "transforms.json").write_text(json.dumps(transforms))
     cloud = trimesh.load(scene / "sparse_pc.ply")
     cloud.apply_transform(motion).export(scene / "sparse_pc.ply")
-
-
-def scene_views(scene: Path) -> list[View]:
-    return read_views(FacadeDataParserConfig(data=scene))
 
 
 ANOTHER_FRAME = displaced(2.0, 30.0, 0.5, seed=3)
@@ -1246,7 +1241,7 @@ def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_t
     """As training reads them."""
     bound = (scene / ALIGNMENT).read_bytes()
     move_cameras(scene, displaced(0.1, 1.0, 0.0, seed=3))
-    views = scene_views(scene)
+    views = views_of(scene)
     cast(scene, views, replace(Alignment.load(scene / ALIGNMENT), cameras=BoundCameras()))
     (scene / ALIGNMENT).write_bytes(bound)
     maps = CueMaps.open(scene, "shell")
@@ -1262,7 +1257,7 @@ def change_shell(scene: Path) -> None:
 
 def run_of(scene: Path) -> TrainedRun:
     """A run of a scene, without a model."""
-    views = scene_views(scene)
+    views = views_of(scene)
     halves = [SimpleNamespace(views=views[:5]), SimpleNamespace(views=views[5:])]
     config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
     data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
@@ -1283,7 +1278,7 @@ def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shel
     with pytest.raises(SceneError, match=changed):
         _ = run_of(scene).shell
     assert re.search(changed, shellgs("cast", scene))
-    maps, view = CueMaps.open(scene, "shell"), scene_views(scene)[0]
+    maps, view = CueMaps.open(scene, "shell"), views_of(scene)[0]
     first = r"facade\.ply has changed since: run `shellgs align .*` first, .*; run `shellgs cast"
     with pytest.raises(SceneError, match=first):
         maps.read(view.name, view.camera)
@@ -1336,7 +1331,7 @@ def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, s
     output = shellgs("align", scene)
     assert "It was found for other cameras than these" in output
     assert "Written" in output
-    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(views_of(scene)) is None
 
 
 def test_a_proposal_for_other_cameras_is_not_accepted(scene, shellgs):
@@ -1347,7 +1342,7 @@ def test_a_proposal_for_other_cameras_is_not_accepted(scene, shellgs):
 
 def test_photographs_come_and_go_without_harm_to_the_alignment(scene):
     found = Alignment.load(scene / ALIGNMENT)
-    views = scene_views(scene)
+    views = views_of(scene)
     added = replace(views[0], name="images/new.png", camera=replace(views[0].camera, width=7))
     assert found.cameras.changed([*views[3:], added]) is None
     assert found.cameras.changed(views[4:5]) is None
@@ -1373,7 +1368,7 @@ def test_photographs_in_another_folder_are_the_same(views):
 @pytest.mark.parametrize("digits", [6, 8])
 def test_cameras_printed_again_are_the_same(scene, digits):
     move_cameras(scene, np.eye(4), digits)
-    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(views_of(scene)) is None
 
 
 @pytest.mark.parametrize(
@@ -1435,7 +1430,7 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     validated = Alignment.load(scanned / ALIGNMENT)
     assert (validated.mesher, bool(validated.verdict)) == ("bpa", True)
     assert "10 views cast" in shellgs("cast", scanned)
-    validated.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
+    validated.load_shell(scanned, views_of(scanned))
     assert set(used) == {"bpa"}
     assert "validated with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
     assert Alignment.load(scanned / ALIGNMENT) == replace(validated, mesher="planes", verdict="", metrics={})
@@ -1444,7 +1439,7 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
 def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
     """A proposal's mesh, made without viewpoints, is not the one that is cast."""
     shell, cache = scanned / "shell" / "scan.xyz", scanned / "shell"
-    views = read_views(FacadeDataParserConfig(data=scanned))
+    views = views_of(scanned)
     alignment = Alignment(np.load(scanned / "matrix.npy"), ("shell/scan.xyz",))
     load_shell(shell, cache=cache)
     guessed = (cache / "scan.xyz.planes.ply").read_bytes()
@@ -1461,7 +1456,7 @@ def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
 
 def test_chosen_folders_reach_every_command(scene, shellgs):
     """Photographs and cameras in folders of other names, which the maps' manifest names too."""
-    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    write_colmap(scene, views_of(scene), list(range(1, 11)))
     cloud = trimesh.load(scene / "sparse_pc.ply")
     lines = [
         f"{k} {x} {y} {z} 9 9 9 0.1 {k % 10 + 1} 0"

@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scenes import views_of
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -31,7 +32,7 @@ MILLIMETRES = "are in millimetres instead of metres"
 
 @pytest.fixture(scope="module")
 def views(pristine_scene: Path) -> list[View]:
-    return read_views(FacadeDataParserConfig(data=pristine_scene))
+    return views_of(pristine_scene)
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scenes import parse, write_colmap
+from scenes import parse, views_of, write_colmap
 from training_runs import data_of, model_of, trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.export.frame import scene_frame
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.cue_maps import CueMaps
@@ -49,7 +49,7 @@ def moved_to_national_coordinates(scene: Path) -> None:
 def national(request, scene: Path) -> Path:
     moved_to_national_coordinates(scene)
     if request.param == "COLMAP":
-        views = read_views(FacadeDataParserConfig(data=scene))
+        views = views_of(scene)
         write_colmap(scene, views, list(range(1, len(views) + 1)))
         points = [
             f"{k} {' '.join(map(repr, np.add(NATIONAL, [k % 3, k % 5, k % 7]).tolist()))} 9 9 9 0.1 1 0"
@@ -60,8 +60,8 @@ def national(request, scene: Path) -> Path:
 
 
 def test_cameras_of_a_national_scene_agree_with_the_local_ones(national, pristine_scene):
-    local = read_views(FacadeDataParserConfig(data=pristine_scene))
-    for here, there in zip(local, read_views(FacadeDataParserConfig(data=national)), strict=True):
+    local = views_of(pristine_scene)
+    for here, there in zip(local, views_of(national), strict=True):
         assert there.name == here.name
         moved = there.camera.position.numpy() - NATIONAL
         np.testing.assert_allclose(moved, here.camera.position.numpy(), atol=MILLIMETRE / 100)
@@ -95,10 +95,10 @@ def test_the_transform_saved_by_nerfstudio_keeps_national_coordinates(national, 
 
 
 def test_maps_of_a_national_scene_agree_with_the_local_ones(national, pristine_scene):
-    views = read_views(FacadeDataParserConfig(data=national))
+    views = views_of(national)
     cast_views(PlacedShell.load(national, views, Alignment.load(national / ALIGNMENT)))
     here, there = (CueMaps.open(scene, "shell") for scene in (pristine_scene, national))
-    for local, view in zip(read_views(FacadeDataParserConfig(data=pristine_scene)), views, strict=True):
+    for local, view in zip(views_of(pristine_scene), views, strict=True):
         one, other = here.read(local.name, local.camera), there.read(view.name, view.camera)
         assert one is not None
         assert other is not None
@@ -112,7 +112,7 @@ def test_exports_of_a_national_scene_agree_with_those_of_the_local_one(national,
     """Both have the same shell, and so the same frame."""
     if (national / "sparse").exists():
         pytest.skip("its points are different")
-    views = read_views(FacadeDataParserConfig(data=national))
+    views = views_of(national)
     cast_views(PlacedShell.load(national, views, Alignment.load(national / ALIGNMENT)))
     placed = []
     for name, scene in (("here", pristine_scene), ("there", national)):

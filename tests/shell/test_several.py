@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 from building_models import NATIONAL, Face, cityjson, house, ifc_house, moved, save_json
+from scenes import views_of
 from training_runs import trainer_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMaps
@@ -124,7 +124,7 @@ def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs,
     find = simulate.find_deviations
     monkeypatch.setattr(simulate, "find_deviations", lambda *args, **of: asked.append(of) or find(*args, **of))
     true, files = Alignment.load(scene / ALIGNMENT), split(scene)
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     whole = ShellCaster(load_shell(scene / true.shells[0]), true.shell_to_scene)
     np.save(scene / "matrix.npy", true.shell_to_scene)
     said = shellgs("align", scene, *files, "--matrix", scene / "matrix.npy")
@@ -161,7 +161,7 @@ def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs,
 
 def test_picks_may_be_on_any_of_the_files(scene: Path, shellgs):
     files, true = split(scene), Alignment.load(scene / ALIGNMENT)
-    mesh, views = load_shell(*files), read_views(FacadeDataParserConfig(data=scene))
+    mesh, views = load_shell(*files), views_of(scene)
     places = np.concatenate([corners(mesh, mesh.source == file).reshape(-1, 3)[::97][:8] for file in range(2)])
     picks: dict[int, list[str]] = {}
     for view in views:

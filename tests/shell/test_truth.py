@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import measure_shell
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMaps
@@ -25,10 +25,6 @@ from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment
 from shellgs_method.shell.cast import seen_through
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import UNITS_PER_METRE, Facade, FacadeConfig, scene_camera, settings_of
-
-
-def views_of(scene: Path) -> list[View]:
-    return read_views(FacadeDataParserConfig(data=scene))
 
 
 def map_of(scene: Path, kind: str, view: View) -> CueMap:

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from scenes import cast
+from scenes import cast, views_of
 from training_runs import trainer_of
 from worlds import LAYOUT, compliance_errors, painted, write_folder
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
@@ -270,7 +269,7 @@ def test_the_world_stands_whichever_axis_of_the_shell_is_up(scene, tmp_path, up)
     trimesh.Trimesh(vertices, upright.faces, process=False).export(scene / "shell" / "turned.obj", digits=9)
     motion[:3, 3] = -motion[:3, :3] @ upright.centre
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(motion @ SHELL_FROM_BUILDING)
-    cast(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment(matrix, ("shell/turned.obj",)))
+    cast(scene, views_of(scene), Alignment(matrix, ("shell/turned.obj",)))
     trainer = trainer_of(scene, tmp_path / "run", "shellgs_metric", iterations=2)
     trainer.train()
     trainer.save_checkpoint(2)

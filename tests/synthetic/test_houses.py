@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scenes import views_of
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import SceneLayout
@@ -75,7 +75,7 @@ def test_one_house_is_in_photographs_but_not_in_the_scan(scene: Path, street: St
     """Maps of the shell and true maps differ where that house is, and hardly anywhere else."""
     (missing,) = (house for house in street.houses if not house.is_scanned)
     alignment = Alignment.load(scene / ALIGNMENT)
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     cast_views(PlacedShell.load(scene, views, alignment))
     shell, truth = CueMaps.open(scene, "shell"), CueMaps.open(scene, "truth")
     low, high = sorted(missing.ends[:, 0])
@@ -94,7 +94,7 @@ def test_one_house_is_in_photographs_but_not_in_the_scan(scene: Path, street: St
 
 def test_points_have_tracks_of_the_views_that_show_them(scene: Path):
     points = find_sparse_points(SceneLayout(data=scene))
-    views = read_views(FacadeDataParserConfig(data=scene))
+    views = views_of(scene)
     assert len(points.positions) > 0.9 * CONFIG.points
     assert points.observed is not None
     counts = np.zeros(len(points.positions))
