@@ -22,7 +22,7 @@ from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.frames import Frame, Recording, are_far
 from shellgs_method.files.paths import copies_among
-from shellgs_method.files.photographs import View, not_enlarged, tell_of_borders, tell_of_other_sizes
+from shellgs_method.files.photographs import View, not_enlarged, some_small, tell_of_borders, tell_of_other_sizes
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
@@ -106,8 +106,9 @@ class FacadeDataParser(DataParser):
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)
         if split == "train":
-            check_points(points, views)
-            tell_of_borders(views, config.data)
+            shown = some_small(views)
+            check_points(points, views, shown)
+            tell_of_borders(shown, config.data)
         else:
             _tell_of_copies(recording, whole, config)
         placed = scale * transformed(points.positions, transform)

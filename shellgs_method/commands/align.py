@@ -79,6 +79,7 @@ def align(
     """
     from dataparsers.facade import read_views
     from shellgs_method.files.atomic import recover_folder
+    from shellgs_method.files.photographs import some_small
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.align import PROPOSAL, REPORT, frame_of_matrix, misplaced, refined
@@ -94,7 +95,7 @@ def align(
     if shell or accept or bundle_adjust:
         layout = layout.unadjusted()
     views, points = read_views(layout), read_sparse_points(layout)
-    check_points(points, views)
+    check_points(points, views, some_small(views))
     placement, mesh = start.place(scene, views, points)
     misplacement = misplaced(placement, mesh, views, points)
     is_adjusted = layout.colmap_folder() == ADJUSTED

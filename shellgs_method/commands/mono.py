@@ -41,12 +41,13 @@ def mono(
     from dataparsers.facade import read_views
     from shellgs_method.cues.maps import make_maps
     from shellgs_method.files.cue_maps import CueMaps, find_cues
+    from shellgs_method.files.photographs import some_small
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.sfm_frame import check_points
 
     layout = paths.of(scene)
     views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
-    check_points(points, views)
+    check_points(points, views, some_small(views))
     if max_image_size is None and "shell" in find_cues(scene):
         max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
     licence = f", licence {predictor.licence}" if predictor.licence else ""

@@ -27,8 +27,9 @@ from shellgs_method.geometry.spread import spread
 
 BLACK = 16
 """Brightest of 256 levels in a photograph that shows nothing: that of 12 bits stored as 16."""
-_SMALL, _COMPARED, _FEW = 400, 8, 3  # pixels of the longer side, and photographs, in which borders are looked for
+_SMALL, _SOME = 400, 8  # pixels of the longer side, and photographs, that tell what a scene looks like
 _BORDER, _BORDERED = 3, 0.003  # brightest of a border's 256 levels; share of the pixels, of which in 60 scenes none is
+_FEW = 3  # photographs that may be black in the same places by chance
 _SCALED = 0.1
 """Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
 _OTHERS = (".exr", ".hdr", ".jxl", ".jxr")
@@ -69,6 +70,31 @@ class View:
     def calibrated(self) -> Lens | Camera:
         """The camera that the photograph was taken with, before it is undistorted."""
         return self.lens or self.camera
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a small photograph shows.
+
+    Attributes:
+        view: the photograph, with a camera of its small size.
+        pixels: the photograph, as by :func:`load_photograph`.
+        mask: its mask, as by :func:`load_mask`.
+    """
+
+    view: View
+    pixels: UInt8[np.ndarray, "H W 3"]
+    mask: Bool[np.ndarray, "H W"] | None
+
+
+def some_small(views: Sequence[View]) -> list[Shown]:
+    """Some photographs that are spread over a scene, without damaged ones, which are told where they are used."""
+    shown = []
+    for view in (views[k] for k in spread(len(views), _SOME)):
+        small = replace(view, camera=view.camera.shrunk(_SMALL))
+        with suppress(SceneError, OSError):
+            shown.append(Shown(small, load_photograph(small), load_mask(small)))
+    return shown
 
 
 def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
@@ -264,25 +290,16 @@ def read_mask(path: Path) -> Image.Image:
     return mask
 
 
-def tell_of_borders(views: Sequence[View], scene: Path) -> None:
-    """Tell the user if photographs, of which some are looked at, have the same borders in black.
+def tell_of_borders(photographs: Sequence[Shown], scene: Path) -> None:
+    """Tell the user if photographs have the same borders in black.
 
     Programs that undistort photographs leave corners where these show nothing, and editors letterboxes; a night's sky
     is nowhere black in all photographs.
     """
-    black, compared = None, 0
-    for view in (views[k] for k in spread(len(views), _COMPARED)):
-        small = replace(view, camera=view.camera.shrunk(_SMALL))
-        try:
-            pixels, mask = load_photograph(small), load_mask(small)
-        except (SceneError, OSError):  # which is told where it is used
-            continue
-        own = pixels.max(axis=2) <= _BORDER
-        if mask is not None:
-            own &= mask
-        if black is None or black.shape == own.shape:
-            black, compared = own if black is None else black & own, compared + 1
-    if black is not None and compared >= _FEW and (share := black.mean()) > _BORDERED:
+    kept = ((shown.pixels, True if shown.mask is None else shown.mask) for shown in photographs)
+    black = [(pixels.max(axis=2) <= _BORDER) & mask for pixels, mask in kept]
+    same = [each for each in black if each.shape == black[0].shape]
+    if len(same) >= _FEW and (share := np.logical_and.reduce(same).mean()) > _BORDERED:
         notice(
             f"the photographs of {scene} are black in the same {share:.1%} of their pixels, as in borders of programs "
             "that undistort, or in a time stamp, which are trained on as a part of the scene: mask them."

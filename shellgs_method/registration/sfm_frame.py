@@ -8,21 +8,19 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int, Shaped
-from PIL import Image
+from jaxtyping import Float64, Int, Shaped, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
-from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.files.photographs import Shown, View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import Camera, in_view, positions, project
 from shellgs_method.geometry.lens import Lens
-from shellgs_method.geometry.spread import spread
 from shellgs_method.registration.slips import OF_IMAGES, OF_TRANSFORMS, OfPoses, Slip, first_slip, slips
 
 _FEW = 10  # points that show nothing
-_POINTS, _PHOTOGRAPHS, _SIZE = 1000, 6, 400  # that suffice
+_POINTS = 1000  # that suffice
 _OBSERVATIONS = 50  # that suffice to compare colours
 _OF_PHOTOGRAPHS = 3.0
 """Contrast of hues in which points and their photographs differ less: .5 to 1.3 in three scenes, 0 for heights and
@@ -40,7 +38,7 @@ _DRIFTED = 0.01  # of a photograph's sides: points of 450 models are within .003
 _FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
 
 
-def check_points(points: SparsePoints, views: Sequence[View]) -> None:
+def check_points(points: SparsePoints, views: Sequence[View], photographs: Sequence[Shown]) -> None:
     """Refuse SfM points that are not in the frame of the cameras; warn if that is likely.
 
     Cameras see the points of their own frame, which have the colours of the photographs there.
@@ -48,6 +46,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
     Args:
         points: the SfM points.
         views: photographs of the scene, of any size.
+        photographs: what some of them show.
 
     Raises:
         SceneError: no camera sees them, or they would fit with other axes or in another unit, or other poses would; or
@@ -55,7 +54,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
     """
     if len(points.positions) < _FEW or not views:
         return
-    sight = _Sight.of(points, views)
+    sight = _Sight.of(points, views, photographs)
     wide, apart = (float(np.ptp(each, axis=0).max()) for each in (points.positions, positions(sight.cameras)))
     if wide < _SPECK * apart:
         raise SceneError(
@@ -65,13 +64,13 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
     seen, alike, away = sight.seen(sight.points), sight.alike(sight.points), sight.away(sight.points)
     drift = sight.drift(sight.points)
     if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE and drift <= _DRIFTED:
-        if not alike >= _OWN and _are_others(points, views):
+        if not alike >= _OWN and _are_others(points, photographs):
             notice(
                 f"{points.called} have other colours than the photographs that see them, as if these were others "
                 "than those of the model: if they are in another order, turned, cropped or others of these names, put "
                 "back those that the cameras were found with."
             )
-        if (share := _ignored(points, views)) > _MOSTLY:
+        if (share := _ignored(points, photographs)) > _MOSTLY:
             notice(
                 f"masks, or transparent pixels, ignore {share:.0%} of {points.called}, as if they were inverted: white "
                 "is kept, and black is ignored."
@@ -97,7 +96,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
             "photograph's side away in the median: cameras, images and points are of several models, or were changed "
             "apart from each other; give the files of one."
         )
-    elif (others := alike < _UNLIKE or _are_others(points, views)) or seen < _ALIKE:
+    elif (others := alike < _UNLIKE or _are_others(points, photographs)) or seen < _ALIKE:
         order = ", or the photographs in another order" if others else ""
         colours = ", and they have other colours than the photographs there" if others else ""
         notice(f"{points.called} may be in another frame than the cameras{order}: {apart}{colours}; if so, {remedy}.")
@@ -110,7 +109,7 @@ class _Sight:
     points: Float64[np.ndarray, "N 3"]
     colours: Float64[np.ndarray, "N 3"]
     cameras: Sequence[Camera]
-    photographs: Sequence[tuple[Camera, Float64[np.ndarray, "H W 3"]]]
+    photographs: Sequence[tuple[Camera, UInt8[np.ndarray, "H W 3"]]]
     observed: Sequence[Int[np.ndarray, " M"]] | None = None
     """Indices of the points that each camera observes, where tracks tell."""
     features: Sequence[Float64[np.ndarray, "M 2"]] = (np.empty((0, 2)),)
@@ -119,17 +118,15 @@ class _Sight:
     """The distortion of each camera, if it has any."""
 
     @classmethod
-    def of(cls, points: SparsePoints, views: Sequence[View]) -> _Sight:
+    def of(cls, points: SparsePoints, views: Sequence[View], photographs: Sequence[Shown]) -> _Sight:
         some = np.random.default_rng(0).permutation(len(points.positions))[:_POINTS]
         colours = np.zeros((len(some), 3))
         if points.colours is not None and points.observed is None:  # with tracks, they are of one model
             colours = points.colours[some].astype(np.float64)
-        shown = [views[k] for k in spread(len(views), _PHOTOGRAPHS)] if np.ptp(colours, axis=0).max() > 0 else []
-        photographs = [photograph for view in shown for photograph in _small(view)]
-        if not may_be_of(colours, [image for _, image in photographs]):
-            photographs = []
+        of_these = np.ptp(colours, axis=0).max() > 0 and may_be_of(colours, [shown.pixels for shown in photographs])
+        images = [(shown.view.camera, shown.pixels) for shown in photographs if of_these]
         cameras, lenses = [view.camera for view in views], [view.lens for view in views]
-        sight = cls(points.positions[some], colours, cameras, photographs, lenses=lenses)
+        sight = cls(points.positions[some], colours, cameras, images, lenses=lenses)
         if points.observed is None:
             return sight
         observed, features = [], []
@@ -232,43 +229,35 @@ class _Sight:
         return self.seen(points) > _WELL and self.away(points) < _FAR / 5 and self.drift(points) <= _DRIFTED
 
 
-def _are_others(points: SparsePoints, views: Sequence[View]) -> bool:
+def _are_others(points: SparsePoints, photographs: Sequence[Shown]) -> bool:
     """Whether points have the colours of other photographs as much, or as little, as of those that see them."""
     if points.colours is None:
         return False
-    shown = [(view, *small) for view in (views[k] for k in spread(len(views), _PHOTOGRAPHS)) for small in _small(view)]
+    images = [shown.pixels for shown in photographs]
     own, others = [], []
-    for view, camera, image in shown:
-        inside, pixels, _ = in_view(camera, points.positions[points.of(view)])
+    for view, image in ((shown.view, shown.pixels) for shown in photographs):
+        inside, pixels, _ = in_view(view.camera, points.positions[points.of(view)])
         colours = points.colours[points.of(view)][inside]
         if may_be_of(colours, [image]):
             own.append((colours, _at(pixels, image)))
-            others += [
-                (colours, _at(pixels, other))
-                for *_, other in shown
-                if other is not image and other.shape == image.shape
-            ]
+            alike = [other for other in images if other is not image and other.shape == image.shape]
+            others += [(colours, _at(pixels, other)) for other in alike]
     theirs = _correlation(own)
     return theirs < _OWN and theirs < _correlation(others) + _MORE
 
 
-def _ignored(points: SparsePoints, views: Sequence[View]) -> float:
+def _ignored(points: SparsePoints, photographs: Sequence[Shown]) -> float:
     """Share of the points that some views with masks see, or observe, which these masks ignore; 0 of too few."""
     kept = [np.empty(0, bool)]
-    for view in (views[k] for k in spread(len(views), _PHOTOGRAPHS)):
-        try:
-            mask = load_mask(view)
-        except (SceneError, OSError):  # which is reported where it is used
-            continue
-        if mask is not None:
-            pixels, _ = points.seen_in(view)
-            columns, rows = pixels.astype(int).T
-            kept.append(mask[rows, columns])
+    for shown in photographs:
+        if shown.mask is not None:
+            pixels, _ = points.seen_in(shown.view)
+            kept.append(_at(pixels, shown.mask))
     known = np.concatenate(kept)
     return 1 - float(known.mean()) if len(known) >= _OBSERVATIONS else 0.0
 
 
-def _at(pixels: Float64[np.ndarray, "N 2"], image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "N 3"]:
+def _at(pixels: Float64[np.ndarray, "N 2"], image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, "N *C"]:
     columns, rows = pixels.astype(int).T
     return image[rows, columns]
 
@@ -302,13 +291,3 @@ def _contrast(colours: np.ndarray) -> float:
     """Deviation of red and blue from green; at least 1, of which compression makes a part."""
     red, green, blue = np.asarray(colours, dtype=np.float64).T
     return max(1.0, float(np.hypot(np.std(red - green), np.std(blue - green))))
-
-
-def _small(view: View) -> list[tuple[Camera, np.ndarray]]:
-    """A view's photograph, small, and its camera; none if it is damaged, which is reported where it is used."""
-    camera = view.camera.shrunk(_SIZE)
-    try:
-        image = Image.fromarray(load_photograph(view))
-    except (SceneError, OSError):
-        return []
-    return [(camera, np.asarray(image.resize((camera.width, camera.height), Image.Resampling.BOX), np.float64))]

@@ -17,13 +17,14 @@ from scipy.spatial.transform import Rotation
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
-from shellgs_method.files.photographs import View
+from shellgs_method.files.photographs import View, some_small
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.lens import Lens
+from shellgs_method.registration import sfm_frame
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
-from shellgs_method.registration.sfm_frame import _Sight, check_points
+from shellgs_method.registration.sfm_frame import _Sight
 from shellgs_method.registration.slips import in_degrees, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
@@ -38,6 +39,10 @@ def views(pristine_scene: Path) -> list[View]:
 @pytest.fixture(scope="module")
 def points(pristine_scene: Path) -> SparsePoints:
     return find_sparse_points(FacadeDataParserConfig(data=pristine_scene))
+
+
+def check_points(points: SparsePoints, views: list[View]) -> None:
+    sfm_frame.check_points(points, views, some_small(views))
 
 
 def other(points: SparsePoints, change: np.ndarray) -> SparsePoints:
@@ -265,7 +270,7 @@ def test_colours_that_are_not_of_photographs_are_not_compared_with_them(points, 
 
 def test_a_slip_explains_nothing_if_cameras_do_not_see_what_it_corrects(points, views):
     """The little that is seen of a real photograph may be alike by chance: its sky and its ground."""
-    sight = _Sight.of(other(points, np.diag([1, -1, -1])), views)
+    sight = _Sight.of(other(points, np.diag([1, -1, -1])), views, some_small(views))
     assert sight.explanation(seen=0.0, away=1.0)
     assert replace(sight, cameras=[]).explanation(seen=0.0, away=1.0) is None
 
