@@ -95,33 +95,47 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
         called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
         return _warned(SparsePoints(positions[kept], None, colours[kept], called), layout)
     model = colmap.read_points(layout.data, folder, layout.images_path)
-    points, images = model.points, model.images
+    points = model.points
     kept = _sound(points.positions, layout)
-    observed: dict[int, dict[int, int]] = {number: {} for number in images}  # points and their keypoints
-    for index, point in enumerate(kept):
-        for image, keypoint in zip(points.observers[point].tolist(), points.keypoints[point].tolist(), strict=False):
-            if image in images:
-                observed[image][index] = keypoint
     positions, colours = points.positions[kept], points.colours[kept]
     called = f"the SfM points of {layout.data / folder}"
-    if not any(observed.values()):
+    seen, features = {}, {}
+    for number, (index, keypoints) in _observations(model, kept).items():
+        name = model.images[number].name
+        seen[name], features[name] = index, _features(model, number, points.ids[kept[index]], keypoints)
+    if not any(map(len, seen.values())):
         return _warned(SparsePoints(positions, None, colours, called), layout)
-    seen = {images[k].name: np.array(list(of), dtype=int) for k, of in observed.items()}
-    features = {
-        images[k].name: _features(model, k, points.ids[kept[[*of]]], list(of.values())) for k, of in observed.items()
-    }
     return _warned(SparsePoints(positions, seen, colours, called, features), layout)
 
 
+def _observations(
+    model: colmap.Model, kept: Int[np.ndarray, " N"]
+) -> dict[int, tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]]:
+    """Which of the kept points each image observes, by their tracks, and the last keypoint of each."""
+    none = np.empty(0, int)
+    images, keypoints = (
+        np.concatenate([none, *(tracks[point] for point in kept)])
+        for tracks in (model.points.observers, model.points.keypoints)
+    )
+    index = np.repeat(np.arange(len(kept)), [len(model.points.observers[point]) for point in kept])
+    order = np.argsort(images, kind="stable")
+    images, keypoints, index = images[order], keypoints[order], index[order]
+    last = np.append((images[1:] != images[:-1]) | (index[1:] != index[:-1]), True)[: len(index)]
+    images, keypoints, index = images[last], keypoints[last], index[last]
+    numbers = np.array([*model.images], int)
+    ends = zip(np.searchsorted(images, numbers), np.searchsorted(images, numbers, "right"), strict=True)
+    return {number: (index[a:b], keypoints[a:b]) for number, (a, b) in zip(model.images, ends, strict=True)}
+
+
 def _features(
-    model: colmap.Model, number: int, points: Int[np.ndarray, " M"], keypoints: list[int]
+    model: colmap.Model, number: int, points: Int[np.ndarray, " M"], numbers: Int[np.ndarray, " M"]
 ) -> Float64[np.ndarray, "M 2"]:
     """Where a photograph of a model has these points, by their tracks' keypoints, in shares of its width and height.
 
     NaN where that is unknown, as the keypoint is of another point: OpenMVG writes its own numbers of them into tracks.
     Likewise where all are in one place, as of scripts that write some, as the format wants them.
     """
-    image, numbers = model.images[number], np.array(keypoints, dtype=int)
+    image = model.images[number]
     found = np.full((len(numbers), 2), np.nan)
     with suppress(ValueError):  # they are damaged
         pixels, of = image.features["xy"], image.features["point"]
