@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dataparsers.facade import FacadeDataParserConfig
-from shellgs_method.files.colmap import Model, Points, read_model, write_model
+from shellgs_method.files.colmap import Model, read_model, write_model
 
 HELD_OUT = FacadeDataParserConfig.eval_interval
 """Every 8th photograph is held out."""
@@ -47,16 +47,10 @@ def _split(names: Iterable[str], n: int) -> tuple[list[str], list[str]]:
 
 def _without_others(model: Model, names: Collection[str]) -> Model:
     images = {number: image for number, image in model.images.items() if image.name in names}
-    points, kept = model.points, np.array([*images])
-    seen = [np.isin(observers, kept) for observers in model.points.observers]
-    left = [k for k, each in enumerate(seen) if each.sum() >= 2]
-    thinned = Points(
-        points.positions[left],
-        points.colours[left],
-        [points.observers[k][seen[k]] for k in left],
-        [points.keypoints[k][seen[k]] for k in left],
-        points.ids[left],
-    )
+    tracks = model.points.tracks
+    tracks = tracks[np.isin(tracks["image"], [*images])]
+    left = np.bincount(tracks["point"], minlength=len(model.points.ids)) >= 2
+    thinned = replace(model.points, tracks=tracks).taken(np.flatnonzero(left))
     for number, image in images.items():
         features = image.features.copy()
         features["point"][~np.isin(features["point"], thinned.ids)] = -1

@@ -15,7 +15,16 @@ from benchmarks import fill, page
 from benchmarks.fewer import keep_every
 from benchmarks.grid import GRID, RESULTS, SHELL, SYNTHETIC, Cell, Setting
 from shellgs_method.compare.runs import Run
-from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, Points, read_model, write_model
+from shellgs_method.files.colmap import (
+    KEYPOINT,
+    ColmapCamera,
+    ColmapImage,
+    Model,
+    Points,
+    read_model,
+    tracks_of,
+    write_model,
+)
 
 HERE = {"commit": "0123456789", "machine": "a machine"}
 CELLS = {cell.file(): cell for setting in GRID for cell in setting.cells}
@@ -176,11 +185,11 @@ def test_of_a_model_the_points_stay_that_two_of_the_photographs_still_show(tmp_p
         features = np.zeros(len(tracks), KEYPOINT)
         features["point"] = [number if k in track else -1 for number, track in enumerate(tracks)]
         images[k] = ColmapImage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, float(k)), 1, f"{k}.png", features)
+    point = np.repeat(np.arange(4), [len(track) for track in tracks])
     points = Points(
         np.eye(4, 3),
         np.zeros((4, 3), np.uint8),
-        [np.array(track) for track in tracks],
-        [np.full(len(track), number) for number, track in enumerate(tracks)],
+        tracks_of(point, np.concatenate(tracks), point),
         np.arange(4),
     )
     camera = ColmapCamera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
@@ -190,7 +199,8 @@ def test_of_a_model_the_points_stay_that_two_of_the_photographs_still_show(tmp_p
     assert {image.name for image in model.images.values()} == {f"{k}.png" for k in (0, 1, 3, 5, 7, 8)}
     np.testing.assert_array_equal(model.points.ids, [1, 3])
     np.testing.assert_array_equal(model.points.positions, np.eye(4, 3)[[1, 3]])
-    assert [observers.tolist() for observers in model.points.observers] == [[1, 3], [0, 5]]
+    tracks = model.points.tracks
+    assert [tracks["image"][tracks["point"] == k].tolist() for k in (0, 1)] == [[1, 3], [0, 5]]
     assert model.images[1].features["point"].tolist() == [-1, 1, -1, -1]
     assert (tmp_path / "train_list.txt").read_text().split() == ["1.png", "3.png", "5.png", "7.png"]
     assert (tmp_path / "test_list.txt").read_text().split() == ["0.png", "8.png"]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, decimal_comma, notice
@@ -103,16 +103,37 @@ class Points:
     Attributes:
         positions: in the model's frame.
         colours: RGB.
-        observers: ids of the images that observe each point.
-        keypoints: index of each observation among the keypoints of its image.
+        tracks: observations of the points, by :func:`tracks_of`, in their order.
         ids: COLMAP's number of each point.
     """
 
     positions: Float64[np.ndarray, "N 3"]
     colours: UInt8[np.ndarray, "N 3"]
-    observers: list[Int64[np.ndarray, " M"]]
-    keypoints: list[Int64[np.ndarray, " M"]]
+    tracks: Shaped[np.ndarray, " O"]
     ids: Int64[np.ndarray, " N"]
+
+    def taken(self, kept: Int64[np.ndarray, " M"]) -> Points:
+        """The points with these indices, which ascend."""
+        place = np.full(len(self.ids), -1)
+        place[kept] = np.arange(len(kept))
+        tracks = self.tracks[place[self.tracks["point"]] >= 0]
+        tracks["point"] = place[tracks["point"]]
+        return Points(self.positions[kept], self.colours[kept], tracks, self.ids[kept])
+
+
+_POINT = np.dtype(
+    [("id", "<u8"), ("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("observations", "<u8")]
+)
+"""A point of points3D.bin, which its track follows."""
+
+
+def tracks_of(
+    points: Int64[np.ndarray, " O"], images: Int64[np.ndarray, " O"], keypoints: Int64[np.ndarray, " O"]
+) -> Shaped[np.ndarray, " O"]:
+    """Observations: the index of a point, the number of an image, and the index of one of its keypoints."""
+    tracks = np.empty(len(points), [("point", np.int64), ("image", np.int64), ("keypoint", np.int64)])
+    tracks["point"], tracks["image"], tracks["keypoint"] = points, images, keypoints
+    return tracks
 
 
 @dataclass(frozen=True)
@@ -214,10 +235,11 @@ def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -
             name, features = image.name.encode(errors="surrogateescape"), image.features
             file.write(name + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
     points = model.points
+    observed = np.stack([points.tracks["image"], points.tracks["keypoint"]], axis=1).astype("<i4")
+    tracks = np.split(observed, np.searchsorted(points.tracks["point"], np.arange(1, len(points.ids))))
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(points.ids)))
-        for k, number in enumerate(points.ids):
-            track = np.stack([points.observers[k], points.keypoints[k]], axis=1).astype("<i4")
+        for k, (number, track) in enumerate(zip(points.ids, tracks, strict=False)):  # one of no points
             file.write(struct.pack("<Q3d3Bd", number, *points.positions[k], *points.colours[k], errors[k]))
             file.write(struct.pack("<Q", len(track)) + track.tobytes())
 
@@ -340,6 +362,13 @@ class _Bytes:
         self.at += struct.calcsize(form)
         return values
 
+    def part(self, size: int) -> bytes:
+        part = self.data[self.at : self.at + size]
+        if len(part) < size:
+            raise ValueError("it ends too early")
+        self.at += size
+        return part
+
     def text(self) -> str:
         end = self.data.index(b"\0", self.at)
         text = self.data[self.at : end].decode("utf-8", "surrogateescape")
@@ -436,11 +465,14 @@ def _are_keypoints(line: str) -> bool:
 
 
 def _binary_points(file: _Bytes) -> Points:
-    rows = []
+    points, tracks = bytearray(), bytearray()
     for _ in file.records():
-        number, *known, _, count = file.take("<Q3d3BdQ")
-        rows.append((number, known[:3], known[3:], file.array("<i4", 2 * count).astype(np.int64)))
-    return _points(rows)
+        points += (point := file.part(_POINT.itemsize))
+        tracks += file.part(8 * int.from_bytes(point[-8:], "little"))
+    known, observed = np.frombuffer(points, _POINT), np.frombuffer(tracks, "<i4").reshape(-1, 2)
+    of = np.repeat(np.arange(len(known)), known["observations"].astype(np.int64))
+    position, colour = known["position"].copy(), known["colour"].copy()
+    return Points(position, colour, tracks_of(of, *observed.T), known["id"].astype(np.int64))
 
 
 def _text_points(lines: Iterator[str]) -> Points:
@@ -450,6 +482,8 @@ def _text_points(lines: Iterator[str]) -> Points:
         colour = [_whole(word) for word in words[4:7]]
         if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
             raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
+        if len(words) > 8 and len(words) % 2:
+            raise ValueError(f"the track of point {words[0]} is not of pairs of an image and a keypoint")
         rows.append((int(words[0]), position, colour, np.array(words[8:], dtype=np.int64)))
     return _points(rows)
 
@@ -457,10 +491,10 @@ def _text_points(lines: Iterator[str]) -> Points:
 def _points(rows: list[tuple[int, list, list, np.ndarray]]) -> Points:
     """Points of their numbers, positions, colours and tracks: image and keypoint of one observation after another."""
     ids, positions, colours, tracks = zip(*rows, strict=True) if rows else ((),) * 4
+    observed = np.concatenate([np.empty(0, np.int64), *tracks]).reshape(-1, 2)
     return Points(
         np.array(positions, dtype=np.float64).reshape(-1, 3),
         np.array(colours, dtype=np.uint8).reshape(-1, 3),
-        [track[::2] for track in tracks],
-        [track[1::2] for track in tracks],
+        tracks_of(np.repeat(np.arange(len(ids)), [len(track) // 2 for track in tracks]), *observed.T),
         np.array(ids, dtype=np.uint64).astype(np.int64),
     )

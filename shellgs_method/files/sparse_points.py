@@ -95,36 +95,19 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
         called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
         return _warned(SparsePoints(positions[kept], None, colours[kept], called), layout)
     model = colmap.read_points(layout.data, folder, layout.images_path)
-    points = model.points
-    kept = _sound(points.positions, layout)
-    positions, colours = points.positions[kept], points.colours[kept]
+    points = model.points.taken(_sound(model.points.positions, layout))
     called = f"the SfM points of {layout.data / folder}"
+    tracks = points.tracks[np.argsort(points.tracks["image"], kind="stable")]
+    again = (tracks["image"][1:] == tracks["image"][:-1]) & (tracks["point"][1:] == tracks["point"][:-1])
+    tracks = tracks[np.append(~again, True)[: len(tracks)]]
     seen, features = {}, {}
-    for number, (index, keypoints) in _observations(model, kept).items():
-        name = model.images[number].name
-        seen[name], features[name] = index, _features(model, number, points.ids[kept[index]], keypoints)
+    for number, image in model.images.items():
+        own = tracks[slice(*np.searchsorted(tracks["image"], [number, number + 1]))]
+        seen[image.name] = own["point"]
+        features[image.name] = _features(model, number, points.ids[own["point"]], own["keypoint"])
     if not any(map(len, seen.values())):
-        return _warned(SparsePoints(positions, None, colours, called), layout)
-    return _warned(SparsePoints(positions, seen, colours, called, features), layout)
-
-
-def _observations(
-    model: colmap.Model, kept: Int[np.ndarray, " N"]
-) -> dict[int, tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]]:
-    """Which of the kept points each image observes, by their tracks, and the last keypoint of each."""
-    none = np.empty(0, int)
-    images, keypoints = (
-        np.concatenate([none, *(tracks[point] for point in kept)])
-        for tracks in (model.points.observers, model.points.keypoints)
-    )
-    index = np.repeat(np.arange(len(kept)), [len(model.points.observers[point]) for point in kept])
-    order = np.argsort(images, kind="stable")
-    images, keypoints, index = images[order], keypoints[order], index[order]
-    last = np.append((images[1:] != images[:-1]) | (index[1:] != index[:-1]), True)[: len(index)]
-    images, keypoints, index = images[last], keypoints[last], index[last]
-    numbers = np.array([*model.images], int)
-    ends = zip(np.searchsorted(images, numbers), np.searchsorted(images, numbers, "right"), strict=True)
-    return {number: (index[a:b], keypoints[a:b]) for number, (a, b) in zip(model.images, ends, strict=True)}
+        return _warned(SparsePoints(points.positions, None, points.colours, called), layout)
+    return _warned(SparsePoints(points.positions, seen, points.colours, called, features), layout)
 
 
 def _features(

@@ -80,13 +80,11 @@ def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle,
 
 def _tracks(model: Model, numbers: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """View, point and pixel of each observation."""
-    observers, keypoints = model.points.observers, model.points.keypoints
-    counts = [len(track) for track in observers]
-    if sum(counts) == 0:
+    tracks = model.points.tracks
+    if len(tracks) == 0:
         raise SceneError("the SfM points have no tracks, without which cameras cannot be adjusted")
-    images, index = np.concatenate(observers), np.concatenate(keypoints)
-    points = np.repeat(np.arange(len(counts)), counts)
-    views = np.array([numbers.get(number, -1) for number in images.tolist()])
+    points, index = tracks["point"], tracks["keypoint"]
+    views = np.array([numbers.get(number, -1) for number in tracks["image"].tolist()])
     pixels = np.full((len(views), 2), np.nan)
     for number, image in model.images.items():
         of = np.flatnonzero(views == numbers[number])

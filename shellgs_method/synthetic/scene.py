@@ -19,7 +19,7 @@ from shellgs_method.bounds import FromOne, Pixels, Seed, Views, check_bounds
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, unfinished
 from shellgs_method.files.bound_cameras import BoundCameras
-from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, write_model
+from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, tracks_of, write_model
 from shellgs_method.files.colmap import Points as SfmPoints
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.geometry.camera import Camera, project
@@ -200,16 +200,14 @@ def _model(names: list[str], site: Site, points: Points) -> tuple[Model, Float64
         images[number] = ColmapImage(tuple(quaternion), tuple(viewmat[:3, 3]), 1, Path(name).name, keypoints)
     K, camera = site.cameras[0].K.numpy(), site.cameras[0]
     lens = ColmapCamera("PINHOLE", camera.width, camera.height, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    observers = [np.flatnonzero(of) for of in seen.T]
-    tracks = [order[views, point] for point, views in enumerate(observers)]
+    point, view = np.nonzero(seen.T)
     cloud = SfmPoints(
         transformed(points.positions, SCENE_FROM_BUILDING),
         points.colours,
-        [views + 1 for views in observers],
-        tracks,
-        np.arange(len(observers)) + 1,
+        tracks_of(point, view + 1, order[view, point]),
+        np.arange(seen.shape[1]) + 1,
     )
-    return Model({1: lens}, images, cloud), np.zeros(len(observers))
+    return Model({1: lens}, images, cloud), np.zeros(seen.shape[1])
 
 
 def _write_points(path: Path, points: Points) -> None:

@@ -272,6 +272,10 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
         edit("cameras.txt", "1 PINHOLE 48 32 ", "1 PINHOLE 48 32 1,5 "),
         "cameras.txt has decimal commas ('1,5'): export it with decimal points",
     ),
+    "half an observation": (
+        edit("points3D.txt", " 0.1 1 0\n", " 0.1 1 0 2\n"),
+        "not of pairs of an image and a keypoint",
+    ),
     "half a colour": (edit("points3D.txt", " 9 9 9 ", " 9.5 9 9 "), "9.5 is not a whole number"),
     "a colour of 999": (edit("points3D.txt", " 9 9 9 ", " 999 9 9 "), "points3D.txt is damaged"),
 }

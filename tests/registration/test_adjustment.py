@@ -23,6 +23,7 @@ from shellgs_method.files.colmap import (
     Model,
     Points,
     read_model,
+    tracks_of,
     write_model,
 )
 from shellgs_method.files.cue_maps import CueMaps
@@ -82,10 +83,9 @@ def tracked(surface: ShellSurface, seed: int) -> Model:
         x, y, z, w = Rotation.from_matrix(CAMERAS[number - 1].viewmat[:3, :3].numpy()).as_quat()
         translation = tuple(CAMERAS[number - 1].viewmat[:3, 3].tolist())
         images[number] = ColmapImage((w, x, y, z), translation, 1, f"{number:02d}.png", features)
-    observers = [np.flatnonzero(seen[:, k]) + 1 for k in kept]
-    keypoints = [np.full(len(track), k) for k, track in enumerate(observers)]
+    point, view = np.nonzero(seen[:, kept].T)
     colours = np.full((len(kept), 3), 128, np.uint8)
-    known = Points(points[kept], colours, observers, keypoints, np.arange(1, len(kept) + 1))
+    known = Points(points[kept], colours, tracks_of(point, view + 1, point), np.arange(1, len(kept) + 1))
     K = (camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2])
     return Model({1: ColmapCamera("PINHOLE", WIDTH, HEIGHT, K)}, images, known)
 
@@ -160,10 +160,7 @@ def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model):
         assert again.images[number][:4] == image[:4]
         np.testing.assert_array_equal(again.images[number].features, image.features)
     np.testing.assert_array_equal(again.points.positions, model.points.positions)
-    for name in ("observers", "keypoints"):
-        np.testing.assert_array_equal(
-            np.concatenate(getattr(again.points, name)), np.concatenate(getattr(model.points, name))
-        )
+    np.testing.assert_array_equal(again.points.tracks, model.points.tracks)
 
 
 def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent: Model):
@@ -185,15 +182,7 @@ def test_a_wall_that_unbending_moves_to_the_edge_of_reach_is_found(surface: Shel
 
 
 def test_of_few_tracks_more_are_held_out(surface: ShellSurface, bent: Model):
-    points = bent.points
-    kept = np.sort(np.random.default_rng(1).permutation(len(points.ids))[:450])
-    few = Points(
-        points.positions[kept],
-        points.colours[kept],
-        [points.observers[k] for k in kept],
-        [points.keypoints[k] for k in kept],
-        points.ids[kept],
-    )
+    few = bent.points.taken(np.sort(np.random.default_rng(1).permutation(len(bent.points.ids))[:450]))
     found = adjusted(surface, replace(bent, points=few), surface.survey_from_shell, NAMES)
     assert found.held_out.points > FEW
     assert found.held_out.gain > SIGNIFICANT
@@ -252,9 +241,7 @@ def test_picks_say_where_along_a_bare_wall_it_is(surface: ShellSurface, model: M
     """The wall's points say nothing of a shift along it, and picks with 1 cm of noise do, as their number allows."""
     wall = ShellSurface(ShellMesh(np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]]), FACES))
     on_wall = np.abs(model.points.positions[:, 1]) < 0.01
-    kept, points = np.flatnonzero(on_wall), model.points
-    observers, keypoints = ([of[k] for k in kept] for of in (points.observers, points.keypoints))
-    bare = Points(points.positions[kept], points.colours[kept], observers, keypoints, points.ids[kept])
+    bare = model.points.taken(np.flatnonzero(on_wall))
     model = replace(model, points=bare)
     survey_from_scene = wall.survey_from_shell.copy()
     survey_from_scene[0, 3] += 0.1
@@ -282,11 +269,10 @@ def test_points_that_are_nan_and_lenses_without_photographs_change_nothing(surfa
 
 
 def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
-    none = [np.empty(0, np.int64)] * len(model.points.ids)
     with pytest.raises(SceneError, match="have no tracks"):
         adjusted(
             surface,
-            replace(model, points=replace(model.points, observers=none, keypoints=none)),
+            replace(model, points=replace(model.points, tracks=model.points.tracks[:0])),
             surface.survey_from_shell,
             NAMES,
         )

@@ -12,7 +12,16 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, Points, read_model, write_model
+from shellgs_method.files.colmap import (
+    KEYPOINT,
+    ColmapCamera,
+    ColmapImage,
+    Model,
+    Points,
+    read_model,
+    tracks_of,
+    write_model,
+)
 from shellgs_method.geometry.distortion import PARAMETERS, to_pixels
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration.bundle import (
@@ -179,11 +188,11 @@ def as_model(bundle: Bundle, seen: Observations) -> Model:
     features = np.empty((views, points), KEYPOINT)
     features["xy"][seen.views, seen.points], features["point"] = seen.pixels, np.arange(1, points + 1)
     images = {k + 1: ColmapImage((1, 0, 0, 0), (0, 0, 0), 1, f"{k}.png", features[k]) for k in range(views)}
-    observers = [np.arange(1, views + 1) for _ in range(points)]
-    keypoints = [np.full(views, k) for k in range(points)]
+    point = np.repeat(np.arange(points), views)
+    tracks = tracks_of(point, np.tile(np.arange(1, views + 1), points), point)
     cameras = {1: ColmapCamera("OPENCV", 640, 480, tuple(LENS[:8]))}
     colours = np.zeros((points, 3), np.uint8)
-    known = Points(bundle.points, colours, observers, keypoints, np.arange(1, points + 1))
+    known = Points(bundle.points, colours, tracks, np.arange(1, points + 1))
     return adjusted_model(Model(cameras, images, known), bundle, np.eye(4))
 
 
@@ -214,8 +223,8 @@ def two_lenses() -> Model:
         features["xy"], features["point"] = xy[:19], np.arange(1, 20)
         quaternion = tuple(turn.as_quat()[[3, 0, 1, 2]].tolist())
         images[number] = ColmapImage(quaternion, tuple(shift.tolist()), lens, f"{number}.png", features)
-    observers, keypoints = [np.array([4, 9])] * 20, [np.full(2, k) for k in range(20)]
-    known = Points(points, np.zeros((20, 3), np.uint8), observers, keypoints, np.arange(1, 21))
+    point = np.repeat(np.arange(20), 2)
+    known = Points(points, np.zeros((20, 3), np.uint8), tracks_of(point, np.tile([4, 9], 20), point), np.arange(1, 21))
     return Model(cameras, images, known)
 
 

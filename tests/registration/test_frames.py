@@ -190,14 +190,15 @@ def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, view
         images[number] = colmap.ColmapImage((scalar, x, y, z), tuple(viewmat[:3, 3]), 1, Path(view.name).name, features)
     ids = np.arange(len(points.positions))
     every = [known.observed[view.name] for view in views]
-    observers = [np.array([k for k, of in enumerate(every) if point in of], int) for point in ids]
-    keypoints = [np.array([np.searchsorted(every[k], point) for k in of], int) for point, of in enumerate(observers)]
+    keypoints = np.concatenate([np.arange(len(of)) for of in every])
     if shown == "numbers of other keypoints":  # as of OpenMVG's converter
-        keypoints = [each // 2 for each in keypoints]
+        keypoints //= 2
+    tracks = colmap.tracks_of(np.concatenate(every), np.repeat(np.arange(len(every)), [*map(len, every)]), keypoints)
+    tracks = tracks[np.argsort(tracks["point"], kind="stable")]
     f = 1.2 if shown == "a focal length of another lens" else 1.0
     camera = colmap.ColmapCamera("PINHOLE", w, h, (f * K[0, 0], f * K[1, 1], K[0, 2], K[1, 2]))
     assert points.colours is not None
-    cloud = colmap.Points(points.positions, points.colours, observers, keypoints, ids)
+    cloud = colmap.Points(points.positions, points.colours, tracks, ids)
     colmap.write_model(scene / "sparse" / "0", colmap.Model({1: camera}, images, cloud), np.zeros(len(ids)))
     (scene / "transforms.json").unlink()
     layout = FacadeDataParserConfig(data=scene)
