@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from cameras import pinhole
 
 from shellgs_method.files.splats import Splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.view import ViewRenderer
 
-CAMERA = Camera(torch.eye(4), torch.tensor([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), 160, 120)
+CAMERA = pinhole(90, 160, 120, dtype=torch.float32)
 
 
 def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:

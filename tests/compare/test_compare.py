@@ -27,6 +27,7 @@ import psutil
 import pytest
 import torch
 import trimesh
+from cameras import pinhole
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from rich.console import Console
@@ -884,7 +885,7 @@ def test_snapshots_hold_renders_of_the_views(measured):
 def flat_wall(alpha: float, before: float = 0.0) -> tuple[Rendering, Camera, dict]:
     """A render of a wall that is right, of an opacity, and a batch in which photographs show something before it."""
     height, width = 24, 32
-    camera = Camera(torch.eye(4), torch.tensor([[30.0, 0, width / 2], [0, 30, height / 2], [0, 0, 1]]), width, height)
+    camera = pinhole(30, width, height, dtype=torch.float32)
     normal, depth = torch.zeros(height, width, 3), torch.full((height, width, 1), 5.0)
     normal[..., 2] = -1
     batch = {"shell_depth": depth, "shell_normal": normal, "shell_mask": torch.ones_like(depth, dtype=torch.bool)}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from PIL import Image
 from scenes import parse, views_of, write_colmap
 from training_runs import data_of, held_out, model_of, trainer_of
@@ -22,7 +23,6 @@ from shellgs_method.files.paths import mask_names, masks_among, photographs_in, 
 from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses.objective import ExtraLossConfig, SelfLosses
 from shellgs_method.registration.validation import validate
 from shellgs_method.render.maps import Geometry
@@ -377,7 +377,7 @@ def test_masked_pixels_are_in_no_image_metric(monkeypatch):
 
 def test_masked_pixels_are_in_no_term_of_the_rendered_geometry():
     normal = torch.randn(6, 8, 3, generator=torch.Generator().manual_seed(0))
-    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), 8, 6)
+    camera = pinhole(9, 8, 6, dtype=torch.float32)
     depth, alpha, kept = torch.full((6, 8, 1), 5.0), torch.ones(6, 8, 1), torch.zeros(6, 8, 1, dtype=torch.bool)
     kept[:, 4:] = True
     extra = ExtraLossConfig(normal_consistency=1.0, normal_consistency_from=0, distortion=1.0)
@@ -394,7 +394,7 @@ def test_masked_pixels_are_in_no_term_of_the_rendered_geometry():
 
 def test_normal_consistency_leaves_out_pixels_with_a_cue():
     normal = torch.randn(6, 8, 3, generator=torch.Generator().manual_seed(0))
-    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), 8, 6)
+    camera = pinhole(9, 8, 6, dtype=torch.float32)
     geometry = Geometry(torch.full((6, 8, 1), 5.0), normal, torch.ones(6, 8, 1), camera)
     kept, with_cue = torch.ones(6, 8, 1, dtype=torch.bool), torch.zeros(6, 8, 1, dtype=torch.bool)
     kept[0], with_cue[:, 4:] = False, True

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import torch
+from cameras import pinhole
 from torch import nn
 
 from shellgs_method.gaussians.pruning import HARDLY, broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
 
 PIXELS = 100
-K = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
-CAMERAS = [Camera(torch.eye(4), K, 10, 10)] * 2
+CAMERAS = [pinhole(10, 10, 10, dtype=torch.float32)] * 2
 
 
 def removed(shares: tuple[float, float], deviations: float, in_view: bool = True) -> bool:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from nerfstudio.models.splatfacto import SH2RGB
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -42,10 +43,7 @@ TURNED = torch.from_numpy(Rotation.from_euler("xyz", [0.03, -0.05, 0.1]).as_matr
 
 
 def camera(position: tuple[float, float, float]) -> Camera:
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3], viewmat[:3, 3] = TURNED, -TURNED @ torch.tensor(position, dtype=torch.float64)
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(viewmat, K, WIDTH, HEIGHT)
+    return pinhole(FOCAL, WIDTH, HEIGHT, position, TURNED.numpy())
 
 
 def view(position=(0.0, 0.0, 0.0), colour: float = 0.5, normal=NORMAL) -> SeededView:
@@ -123,7 +121,7 @@ def test_seeds_are_on_what_photographs_show_before_the_shell_or_behind_it(monkey
     monkeypatch.setattr(pixels, "MARGIN", margin)
     kept = [True, False, True, True, False]
     batch = pixel_by_pixel(other_depth=[4.0, 4, 0, 25, 25], mask=kept)
-    here = Camera(torch.eye(4), torch.tensor([[3.0, 0, 2.5], [0, 3, 0.5], [0, 0, 1]]), 5, 1)
+    here = pinhole(3, 5, 1, dtype=torch.float32)
     towards = -here.rays() / here.rays().norm(dim=-1, keepdim=True)
     shell = torch.tensor([0.0, 0.6, -0.8]).half().float()
     on_shell, surface, behind = (make(here, batch) for make in (view_of_shell, view_of_surface, view_behind_shell))

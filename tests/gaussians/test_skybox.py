@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from cameras import pinhole
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.gaussians.densification import SkyboxStrategy
 from shellgs_method.gaussians.skybox import RADIUS, SkyView, skybox_seeds, view_of_sky
-from shellgs_method.geometry.camera import Camera
 
 FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
-K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
 TURNED = Rotation.from_euler("xyz", [0.2, -0.4, 0.6]).as_matrix()
-VIEWMAT = torch.eye(4, dtype=torch.float64)
-VIEWMAT[:3, :3], VIEWMAT[:3, 3] = torch.from_numpy(TURNED), -torch.from_numpy(TURNED[:, 0])
-CAMERA = Camera(VIEWMAT, K, WIDTH, HEIGHT)
-"""At (1, 0, 0), turned about each axis."""
+CAMERA = pinhole(FOCAL, WIDTH, HEIGHT, (1, 0, 0), TURNED)
 
 
 def sky_view(mask: torch.Tensor | None = None) -> SkyView:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import trimesh
+from cameras import pinhole
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
@@ -29,10 +29,7 @@ def walls_of(mesh: trimesh.Trimesh, shots: list[tuple[list[float], list[float]]]
 
 def camera_at(eye: np.ndarray, forward: np.ndarray, up: np.ndarray) -> Camera:
     right = np.cross(forward, up)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return Camera(torch.from_numpy(viewmat), torch.tensor([[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]).double(), 100, 100)
+    return pinhole(50, 100, 100, eye, np.stack([right, np.cross(forward, right), forward]))
 
 
 def test_walls_are_those_that_are_seen_the_largest_first():

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from kornia.metrics import ssim as kornia_ssim
 from scipy.ndimage import gaussian_filter, sobel
 from torch.autograd import gradcheck
 
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_along_rays
 from shellgs_method.losses import (
     EmptySpaceLoss,
@@ -49,9 +49,8 @@ def some_normals(random: torch.Generator) -> torch.Tensor:
 
 def wall(normal: tuple[float, float, float], distance: float = 8.0) -> torch.Tensor:
     """z-depth of the plane n · x = -distance, seen at 96 x 64 pixels with a focal length of 100."""
-    K = torch.tensor([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]], dtype=torch.float64)
     n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
-    rays = Camera(torch.eye(4, dtype=torch.float64), K, 96, 64).rays()
+    rays = pinhole(100, 96, 64).rays()
     return (-distance / (rays @ n))[..., None]
 
 
@@ -316,8 +315,7 @@ def test_photometric_loss_has_no_gradient_outside_the_mask(random):
 
 def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Depth, normals and rays of a wall at ``depth`` along the optical axis, turned by ``yaw``."""
-    K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
-    rays = Camera(torch.eye(4, dtype=torch.float64), K, WIDTH, HEIGHT).rays()
+    rays = pinhole(20, WIDTH, HEIGHT).rays()
     normal = torch.tensor([math.sin(yaw), 0.0, -math.cos(yaw)], dtype=torch.float64)
     z = depth * normal[2] / (rays @ normal)[..., None]
     return z, normal.expand(HEIGHT, WIDTH, 3), rays
@@ -422,8 +420,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
     mask = torch.rand(height, width, 1, generator=random) < 0.9
     x, y = 0.125 + 0.001 * torch.randn(2, height, width, 1, generator=random)
     a, b, normal, target = torch.rand(4, height, width, 3, generator=random) - 0.5
-    K = torch.tensor([[50.0, 0, width / 2], [0, 50, height / 2], [0, 0, 1]])
-    rays = Camera(torch.eye(4), K, width, height).rays()
+    rays = pinhole(50, width, height, dtype=torch.float32).rays()
 
     def normals(depth):
         return normals_along_rays(depth, rays)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 from training_runs import model_of, trainer_of
@@ -22,10 +23,7 @@ SHIFT = 1.0
 
 def camera(k: int) -> Camera:
     """The k-th of cameras side by side before a wall at z = 8."""
-    viewmat = torch.eye(4)
-    viewmat[0, 3] = -SHIFT * k
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    return Camera(viewmat, K, WIDTH, HEIGHT)
+    return pinhole(FOCAL, WIDTH, HEIGHT, (SHIFT * k, 0, 0), dtype=torch.float32)
 
 
 def image(left: float | None = None, size: int = 30) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from cameras import pinhole
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
 from scenes import views_of
@@ -61,15 +62,12 @@ from shellgs_method.occlusion.verdicts import Verdicts, Votes
 from shellgs_method.viewer import ContradictedShell
 
 WIDTH, HEIGHT = 144, 64
-K = torch.tensor([[160.0, 0, WIDTH / 2], [0, 160, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
 WALL = 8.0
 
 
 def camera_at(x: float) -> Camera:
     """A camera at z = 0 that looks along z."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[0, 3] = -x
-    return Camera(viewmat, K, WIDTH, HEIGHT)
+    return pinhole(160, WIDTH, HEIGHT, (x, 0, 0))
 
 
 def painted(points: np.ndarray, seed: int) -> np.ndarray:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from scipy.ndimage import gaussian_filter
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names
 from shellgs_method.errors import SceneError
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.occlusion import DISPLACED, Displaced, displaced
 from shellgs_method.occlusion.displaced import displacements
 from shellgs_method.occlusion.exposure import Exposed
@@ -25,10 +25,7 @@ ALL = np.ones(9, bool)
 
 def wall(x: float, right: int = 0, down: int = 0) -> Exposed:
     """A view from x of a painted wall, and where it is, but by a photograph that is displaced by some pixels."""
-    viewmat = torch.eye(4)
-    viewmat[0, 3] = -x
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    camera = Camera(viewmat, K, WIDTH, HEIGHT)
+    camera = pinhole(FOCAL, WIDTH, HEIGHT, (x, 0, 0), dtype=torch.float32)
     points = WALL * camera.rays().numpy()[..., :2] + [x, 0] - np.array([right, down]) * WALL / FOCAL
     image = 0.5 + 0.08 * np.sin(points @ WAVES[0].T + WAVES[1]).sum(axis=-1)
     return Exposed(camera, torch.from_numpy(image).float()[..., None].expand(-1, -1, 3), torch.full(image.shape, WALL))

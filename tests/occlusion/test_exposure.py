@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from scipy.optimize import linprog
 
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.occlusion.exposure import (
     Exposed,
     Sightings,
@@ -104,9 +104,7 @@ def test_where_points_tell_they_count_whatever_is_known():
 
 def wall(x: float, gain: np.ndarray) -> Exposed:
     """A view from x of a coloured wall at z = 4."""
-    viewmat = torch.eye(4)
-    viewmat[0, 3] = -x
-    camera = Camera(viewmat, torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), 80, 60)
+    camera = pinhole(60, 80, 60, (x, 0, 0), dtype=torch.float32)
     depth = torch.full((60, 80), 4.0)
     points = (depth[..., None] * camera.rays()).numpy() + np.array([x, 0, 0])
     linear = 0.35 + 0.2 * np.sin(np.stack([points[..., 0], points[..., 1], points[..., 0] + points[..., 1]], axis=-1))

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cameras import pinhole
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View, from_camera, load_upright, to_camera, upright_size
-from shellgs_method.geometry.camera import Camera, project
+from shellgs_method.geometry.camera import project
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.picking.session import Session
 from shellgs_method.registration.picks import Pick, PicksFile, align_picks, read_picks
@@ -28,14 +29,12 @@ def views(tmp_path: Path) -> list[View]:
     """Five cameras on a walk past a wall that is HALVED and at NATIONAL in the shell's frame."""
     made = []
     for k, x in enumerate(np.linspace(-3, 3, 5)):
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = Rotation.from_euler("xy", [90, 4 * x], degrees=True).as_matrix()
-        viewmat[:3, 3] = -viewmat[:3, :3] @ [x, -6.0 + 0.2 * k, 0.1 * k]
-        K = torch.tensor([[300.0, 0, 200], [0, 300, 150], [0, 0, 1]], dtype=torch.float64)
+        turn = Rotation.from_euler("xy", [90, 4 * x], degrees=True).as_matrix()
+        camera = pinhole(300, 400, 300, [x, -6.0 + 0.2 * k, 0.1 * k], turn)
         image = tmp_path / "images" / f"a photo {k}.png"
         image.parent.mkdir(exist_ok=True)
         Image.new("RGB", (800, 600)).save(image)  # twice the camera's size
-        made.append(View(f"images/{image.name}", image, Camera(torch.from_numpy(viewmat), K, 400, 300)))
+        made.append(View(f"images/{image.name}", image, camera))
     return made
 
 

@@ -16,6 +16,7 @@ import pyproj
 import pytest
 import torch
 import trimesh
+from cameras import pinhole
 from PIL import ExifTags, Image
 from scenes import cast, views_of, write_colmap
 from scipy.spatial.transform import Rotation
@@ -437,12 +438,10 @@ def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mes
 def rig(count: int = 3) -> tuple[list[View], np.ndarray]:
     """Views along a baseline that look along +z, 1000 pixels wide, and their 3x4 projections."""
     views = []
-    K = torch.tensor([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]], dtype=torch.float64)
     for k in range(count):
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 10.0 * k - 10, degrees=True).as_matrix())
-        viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([2.0 * k - 2, 0.1 * k, 0.0], dtype=torch.float64)
-        views.append(View(f"images/{k}.png", Path(f"{k}.png"), Camera(viewmat, K, 1000, 800)))
+        turn = Rotation.from_euler("y", 10.0 * k - 10, degrees=True).as_matrix()
+        camera = pinhole(800, 1000, 800, (2.0 * k - 2, 0.1 * k, 0.0), turn)
+        views.append(View(f"images/{k}.png", Path(f"{k}.png"), camera))
     return views, np.stack([(v.camera.K @ v.camera.viewmat[:3]).numpy() for v in views])
 
 
@@ -1041,17 +1040,15 @@ def test_the_bias_is_the_distance_of_the_wall(mesh, views, points):
 
 
 def test_edges_are_at_outlines_steps_and_bends_but_not_on_a_slanted_plane():
-    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], dtype=torch.float64)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 40, degrees=True).as_matrix())
+    aside = pinhole(60, 64, 48, turn=Rotation.from_euler("y", 40, degrees=True).as_matrix())
     plane = ShellMesh(
         np.array([[-99.0, -99, 9], [99, -99, 9], [99, 99, 9], [-99, 99, 9]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
-    assert not shell_edges(ShellCaster(plane, np.eye(4)).cast(Camera(viewmat, K, 64, 48)), 1.0).any()
+    assert not shell_edges(ShellCaster(plane, np.eye(4)).cast(aside), 1.0).any()
     # A plate 10 cm in front of the plane, from -1 to 1: with a focal length of 60 and a depth of 9 it ends at 32 ± 6.7.
     corners = np.array([[-1.0, -1, 8.9], [1, -1, 8.9], [1, 1, 8.9], [-1, 1, 8.9]])
     both = ShellMesh(np.concatenate([plane.vertices, corners]), np.concatenate([plane.faces, plane.faces + 4]))
-    edges = shell_edges(ShellCaster(both, np.eye(4)).cast(Camera(torch.eye(4, dtype=torch.float64), K, 64, 48)), 1.0)
+    edges = shell_edges(ShellCaster(both, np.eye(4)).cast(pinhole(60, 64, 48)), 1.0)
     assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
 
 
@@ -1062,10 +1059,7 @@ def test_a_crease_is_an_edge_and_the_noise_of_triangles_beside_it_is_not():
     vertices = np.stack([u / np.sqrt(2), v, 8 - np.abs(u) / np.sqrt(2) + noise], axis=-1).reshape(-1, 3)
     corner = np.arange(101 * 100).reshape(100, 101)[:, :-1].ravel()
     faces = np.concatenate([corner[:, None] + [0, 1, 101], corner[:, None] + [1, 102, 101]])
-    K = torch.tensor([[600.0, 0, 80], [0, 600, 60], [0, 0, 1]], dtype=torch.float64)
-    cue = ShellCaster(ShellMesh(vertices, faces), np.eye(4)).cast(
-        Camera(torch.eye(4, dtype=torch.float64), K, 160, 120)
-    )
+    cue = ShellCaster(ShellMesh(vertices, faces), np.eye(4)).cast(pinhole(600, 160, 120))
     edges = shell_edges(cue, 1.0)
     neighbours = np.einsum("hwc,hwc->hw", cue.normal[:, 1:].astype(float), cue.normal[:, :-1].astype(float))
     beside = np.abs(np.arange(160) - 79.5) > 8

@@ -7,9 +7,9 @@ from itertools import permutations
 
 import pytest
 import torch
+from cameras import pinhole
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import (
     DISC_LOG_THICKNESS,
     DepthKind,
@@ -24,7 +24,7 @@ from shellgs_method.render.maps import (
 from shellgs_method.render.rasterizer import rasterize
 from shellgs_method.render.view import ViewRenderer
 
-CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), width=40, height=30)
+CAMERA = pinhole(30, 40, 30, dtype=torch.float32)
 
 
 def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-import torch
 import trimesh
+from cameras import pinhole
 from scenes import cast, house, scan
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +26,6 @@ from shellgs_method.shell import Alignment, Mesher, PlacedShell, ShellCaster, Sh
 
 GEOREFERENCE = np.array([410_000.0, 5_413_000.0, 250.0])
 NO_POINTS = np.empty((0, 3))
-K = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]], dtype=torch.float64)
 STREET = np.array([[0.0, 0, -10]])
 OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
 """Any photograph: casting looks whether it is transparent."""
@@ -34,9 +33,7 @@ OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
 
 def camera() -> Camera:
     """A camera on the street that looks along +z at the wall, 10 away."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[2, 3] = 10
-    return Camera(viewmat, K, 80, 60)
+    return pinhole(80, 80, 60, (0, 0, -10))
 
 
 def meshed(points: np.ndarray, mesher: Mesher = "planes", viewpoints: np.ndarray = STREET) -> ShellMesh:

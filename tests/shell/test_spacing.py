@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from cameras import pinhole
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.files import clouds
@@ -34,9 +34,7 @@ def is_window(points: np.ndarray, margin: float) -> np.ndarray:
 
 def camera(x: float, back: float = 6.0, focal: float = 100.0) -> Camera:
     """A camera before the wall, of 80 x 60 pixels."""
-    viewmat = torch.tensor([[1.0, 0, 0, -x], [0, 0, -1, 1.5], [0, 1, 0, back], [0, 0, 0, 1]], dtype=torch.float64)
-    K = torch.tensor([[focal, 0, 40], [0, focal, 30], [0, 0, 1]], dtype=torch.float64)
-    return Camera(viewmat, K, 80, 60)
+    return pinhole(focal, 80, 60, (x, -back, 1.5), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
 
 
 CAMERAS = [camera(x) for x in (8.0, 9.0, 10.0, 11.0, 12.0)]
@@ -167,10 +165,7 @@ def test_a_cloud_is_meshed_again_where_its_unit_is_corrected(tmp_path: Path):
 
 def looking_along_z(focal: float = 100.0, x: float = 0.0, yaw: float = 0.0) -> Camera:
     """100 x 100 pixels."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", yaw).as_matrix())
-    viewmat[:3, 3] = viewmat[:3, :3] @ torch.tensor([-x, 0, 0], dtype=torch.float64)
-    return Camera(viewmat, torch.tensor([[focal, 0, 50], [0, focal, 50], [0, 0, 1]]), 100, 100)
+    return pinhole(focal, 100, 100, (x, 0, 0), Rotation.from_euler("y", yaw).as_matrix())
 
 
 WALL = np.stack([*np.meshgrid(np.linspace(-30, 30, 241), np.linspace(-4, 4, 33)), np.full((33, 241), 10.0)], -1)

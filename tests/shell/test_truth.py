@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from cameras import pinhole
 from PIL import Image
 from scenes import views_of
 
@@ -19,7 +19,6 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import CueMap, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment
 from shellgs_method.shell.cast import seen_through
@@ -168,7 +167,7 @@ def test_what_cannot_be_cast_as_truth_is_refused_and_nothing_changes(scene, shel
 
 
 def test_holes_of_a_mesh_are_told_from_windows(tmp_path):
-    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), 64, 48)
+    camera = pinhole(50, 64, 48)
     view, depth = View("0.png", tmp_path / "0.png", camera), np.full((48, 64), 8.0, np.float32)
     depth[:, :10] = 0  # nothing
     depth[20:32, 30:44] = 10  # a deep window

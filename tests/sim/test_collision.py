@@ -6,20 +6,14 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-import torch
+from cameras import pinhole
 
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.distances import Distances, both_ways, visible
 from shellgs_method.sim.collision.parts import Part, pieces
 
-CAMERA = Camera(
-    torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 1.5], [0, 1, 0, 6], [0, 0, 0, 1]], dtype=torch.float64),
-    torch.tensor([[10.0, 0, 200], [0, 10, 100], [0, 0, 1]], dtype=torch.float64),
-    400,
-    200,
-)
-"""At (0, -6, 1.5), looking along y."""
+CAMERA = pinhole(10, 400, 200, (0, -6, 1.5), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+"""Looking along y."""
 
 
 def wall(low: float, high: float, y: float = 0.0) -> Triangles:

@@ -14,6 +14,7 @@ import pytest
 import shapely
 import torch
 import trimesh
+from cameras import pinhole
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
@@ -450,11 +451,7 @@ def test_a_second_building_is_moved_into_the_frame_of_the_first():
 
 def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:
     """A camera in front of the plane y = 0, looking along y."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, -distance, 1.0], dtype=torch.float64)
-    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], dtype=torch.float64)
-    return Camera(viewmat, K, size, size)
+    return pinhole(size, size, size, (x, -distance, 1), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
 
 
 def pattern(points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from cameras import pinhole
 from dense_reference import DenseDiscs, dense_rasterize_discs
 from gsplat import DefaultStrategy
 from random_splats import NAMES, make_camera, make_splats, orbit
@@ -16,12 +17,6 @@ from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 
 MAPS = ("inverse_depth", "median_depth", "distortion")
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-
-
-def pinhole(width: int, height: int, focal: float) -> Camera:
-    """A camera at the origin that looks along z, with its principal point at the image centre."""
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return Camera(torch.eye(4, dtype=torch.float64), K, width, height)
 
 
 def near_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
@@ -125,7 +120,7 @@ def test_the_distortion_of_two_surfaces_is_the_product_of_weights_and_squared_di
     opacities = torch.tensor([0.6, 0.5], dtype=torch.float64)
     scales, features = torch.ones(2, 3).double(), torch.ones(2, 1).double()
     splats = [means, FACING.expand(2, 4), scales, opacities, features]
-    _, alpha, info = rasterize(*splats, camera=pinhole(1, 1, 1.0), primitive="2d")
+    _, alpha, info = rasterize(*splats, camera=pinhole(1, 1, 1), primitive="2d")
     near, far = (100 / 99.8 * (1 - 0.2 / z) for z in (1, 4))
     assert alpha.item() == pytest.approx(0.8)
     assert info["inverse_depth"].item() == pytest.approx(0.6 / 1 + 0.2 / 4)
@@ -134,7 +129,7 @@ def test_the_distortion_of_two_surfaces_is_the_product_of_weights_and_squared_di
 
 
 def test_an_edge_on_disc_is_invisible_and_has_zero_gradients():
-    camera = pinhole(9, 9, 9.0)
+    camera = pinhole(9, 9, 9)
     quat = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=torch.float64)  # the normal turned from z to -y
     splat = [torch.tensor([[0.0, 0.0, 2.0]]).double(), quat, torch.ones(1, 3).double(), torch.ones(1).double() * 0.9]
     splat = [each.clone().requires_grad_() for each in [*splat, torch.ones(1, 1).double()]]
@@ -149,7 +144,7 @@ def test_a_sub_pixel_disc_is_as_wide_as_a_pixel():
     tiny = torch.full((1, 3), 1e-9, dtype=torch.float64)
     opacity, feature = torch.tensor([0.8], dtype=torch.float64), torch.ones(1, 1).double()
     centre = torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64)
-    _, alpha, _ = rasterize(centre, FACING, tiny, opacity, feature, pinhole(3, 3, 5.0), primitive="2d")
+    _, alpha, _ = rasterize(centre, FACING, tiny, opacity, feature, pinhole(5, 3, 3), primitive="2d")
     assert alpha[1, 1].item() == pytest.approx(0.8)
     assert alpha[1, 0].item() == pytest.approx(0.8 * torch.tensor(-1.0).exp().item())
 
