@@ -17,7 +17,7 @@ from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from scipy.spatial.transform import Rotation
-from training_runs import data_of, held_out, model_of, render, trainer_of
+from training_runs import data_of, densify_early, held_out, model_of, render, trainer_of
 
 import benchmarks.step
 import shellgs_method.render.view
@@ -269,11 +269,6 @@ def test_the_same_seed_on_one_thread_gives_the_same_run_to_the_last_digit(pristi
     first, second = gaussians("first"), gaussians("second")
     torch.set_num_threads(before)
     assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def densify_early(config) -> None:
-    model = config.pipeline.model
-    model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 3, 1e-6
 
 
 def test_a_checkpoint_loads_as_weights_only(trained):

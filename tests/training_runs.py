@@ -46,6 +46,12 @@ def trainer_of(
     return trainer
 
 
+def densify_early(config) -> None:
+    """Change a config so that a run of a dozen iterations densifies."""
+    model = config.pipeline.model
+    model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 3, 1e-6
+
+
 def model_of(trainer: FacadeTrainer) -> FacadeModel:
     model = trainer.pipeline.model
     assert isinstance(model, FacadeModel)

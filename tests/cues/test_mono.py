@@ -15,8 +15,7 @@ import open3d as o3d
 import pytest
 import torch
 from PIL import Image
-from scenes import views_of
-from scipy.spatial.transform import Rotation
+from scenes import views_of, write_colmap
 from training_runs import trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig
@@ -550,24 +549,15 @@ def write_cloud(scene: Path, points: list[np.ndarray]) -> None:
     o3d.io.write_point_cloud(scene / "sparse_pc.ply", cloud)
 
 
-def write_colmap(scene: Path, views: Sequence[View], points: Sequence[np.ndarray]) -> None:
+def write_tracks(scene: Path, views: Sequence[View], points: Sequence[np.ndarray]) -> None:
     """Write a COLMAP text model in which each view observes its own points."""
-    folder = scene / "sparse" / "0"
-    folder.mkdir(parents=True)
-    images, cloud = [], []
-    for number, (view, positions) in enumerate(zip(views, points, strict=True), start=1):
-        w2c = view.camera.viewmat.numpy()
-        x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
-        pose = " ".join(map(repr, map(float, [w, x, y, z, *w2c[:3, 3]])))
-        images += [f"{number} {pose} 1 {Path(view.name).name}", ""]
-        for position in positions:
-            cloud.append(f"{len(cloud) + 1} {' '.join(map(repr, map(float, position)))} 9 9 9 0.1 {number} 0")
-    camera = views[0].camera
-    fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {camera.width} {camera.height} {fx} {fy} {cx} {cy}\n")
-    (folder / "images.txt").write_text("\n".join(images) + "\n")
-    (folder / "points3D.txt").write_text("\n".join(cloud) + "\n")
-    (scene / "transforms.json").unlink()
+    write_colmap(scene, [*views], [*range(1, len(views) + 1)])
+    of_view = [(number, position) for number, positions in enumerate(points, start=1) for position in positions]
+    lines = (
+        f"{k} {' '.join(map(repr, map(float, position)))} 9 9 9 0.1 {number} 0\n"
+        for k, (number, position) in enumerate(of_view, start=1)
+    )
+    (scene / "sparse/0/points3D.txt").write_text("".join(lines))
 
 
 def write_maps(scene: Path, folder: Path, convention: Convention | None = None) -> None:
@@ -583,7 +573,7 @@ def test_imported_true_maps_are_the_truth(scene: Path, tmp_path: Path, monkeypat
     expected = truths(scene)
     maps = tmp_path / "Tiefen – 深度"
     write_maps(scene, maps, "opengl")
-    write_colmap(scene, [view for view, _ in expected], exact_points(scene))
+    write_tracks(scene, [view for view, _ in expected], exact_points(scene))
     words = (scene, "from", maps, "--values", "depth", "--normals", maps, "--convention", "opengl")
     output = run(monkeypatch, capsys, *words)
     assert "10 of 10 views have a map" in output
@@ -683,7 +673,7 @@ def test_a_networks_disparity_is_aligned_to_the_points_of_each_view(
         depths[view.name] = 1 / (scale * (d - d.min()) + 0.05 * (1 + number))
         rows, columns = rng.integers(32, size=80), rng.integers(48, size=80)
         points.append(points_at(depths[view.name], rows, columns, view.camera))
-    write_colmap(scene, views, points)
+    write_tracks(scene, views, points)
     output = run(monkeypatch, capsys, scene, "depth-anything", "--weights", depth_anything)
     assert "10 of 10 views have a map" in output
     assert "licence not stated" in output

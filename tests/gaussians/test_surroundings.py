@@ -12,7 +12,7 @@ import pytest
 import torch
 from scenes import parse
 from scipy.spatial.transform import Rotation
-from training_runs import data_of, model_of
+from training_runs import data_of, densify_early, model_of
 from two_blocks import HALVES, block_run, coarse_run, copied, cut_in_two
 
 from shellgs_method.errors import SceneError
@@ -36,11 +36,6 @@ def street(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 @pytest.fixture(scope="module")
 def coarse(street: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeTrainer:
     return coarse_run(street, tmp_path_factory.mktemp("coarse"))
-
-
-def densify_early(config) -> None:
-    model = config.pipeline.model
-    model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 3, 1e-6
 
 
 def test_a_block_has_the_cameras_and_points_of_the_whole_scene(street):

@@ -7,49 +7,15 @@ from dataclasses import replace
 import gsplat
 import pytest
 import torch
+from against_reference import compare
 from dense_reference import dense_rasterize
 from gsplat import DefaultStrategy
-from random_splats import NAMES, make_camera, make_discs, make_splats, orbit
+from random_splats import make_camera, make_discs, make_splats, orbit
 from torch import Tensor, nn
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine import cpp
 from shellgs_method.render.rasterizer import compositing, rasterize
-
-
-def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, counted: Tensor, means2d: Tensor) -> dict:
-    """Gradients of a random linear function of the counted pixels."""
-    generator = torch.Generator().manual_seed(5)
-    shape = composited.shape[0], composited.shape[1], composited.shape[2] + 1
-    slope = torch.randn(shape, generator=generator, dtype=torch.float64).to(composited) * counted[..., None]
-    (torch.cat([alpha, composited], dim=-1) * slope).sum().backward()
-    gradients = {name: splat.grad for name, splat in zip(NAMES, splats, strict=True)}
-    assert means2d.grad is not None
-    return {**gradients, "means2d": means2d.grad.reshape(-1, 2)}
-
-
-def compare(dtype: torch.dtype, n: int, width: int, height: int, n_features: int, seed: int, margin: float) -> tuple:
-    """Largest error of the values, relative error of each gradient, and share of pixels left out.
-
-    A pixel is left out if alpha or transmittance is within ``margin`` of a threshold (1/255 or 1e-4).
-    """
-    splats = [splat.requires_grad_() for splat in make_splats(n, n_features, seed)]
-    camera = make_camera(width, height)
-    reference = dense_rasterize(*splats, viewmat=camera.viewmat, K=camera.K, width=width, height=height)
-    counted = reference.margin > margin
-    expected = differentiate(splats, reference.composited, reference.alpha, counted, reference.means2d)
-
-    own = [splat.detach().to(dtype).requires_grad_() for splat in splats]
-    composited, alpha, info = rasterize(*own, camera=camera)
-    info["means2d"].retain_grad()
-    assert composited.shape == (height, width, n_features)
-    assert alpha.shape == (height, width, 1)
-    assert composited.dtype == alpha.dtype == dtype
-    actual = differentiate(own, composited, alpha, counted, info["means2d"])
-
-    errors = torch.cat([composited - reference.composited, alpha - reference.alpha], dim=-1)[counted].abs()
-    relative = {k: ((actual[k] - expected[k]).norm() / expected[k].norm()).item() for k in expected}
-    return errors.max().item(), relative, 1 - float(counted.double().mean())
 
 
 def render(n: int, width: int, height: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -62,7 +28,9 @@ def render(n: int, width: int, height: int, dtype: torch.dtype = torch.float32) 
     [(90, 37, 29, 3, 0), (60, 8, 8, 1, 1), (120, 61, 45, 8, 2), (40, 3, 50, 3, 3), (1, 20, 20, 3, 13)],
 )
 def test_values_and_gradients_match_the_reference_in_float64(n, width, height, n_features, seed):
-    error, relative, left_out = compare(torch.float64, n, width, height, n_features, seed, margin=1e-10)
+    error, relative, left_out = compare(
+        make_splats(n, n_features, seed), make_camera(width, height), torch.float64, margin=1e-10
+    )
     assert error < 1e-9
     assert max(relative.values()) < 1e-8, relative
     assert left_out == 0
@@ -72,7 +40,7 @@ def test_values_and_gradients_match_the_reference_in_float64(n, width, height, n
 def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
     if compiled:
         request.getfixturevalue("compiler")
-    error, relative, left_out = compare(torch.float32, 100, 53, 38, 3, seed=1, margin=1e-4)
+    error, relative, left_out = compare(make_splats(100, 3, seed=1), make_camera(53, 38), torch.float32, margin=1e-4)
     assert error < 1e-4
     assert max(relative.values()) < 1e-3, relative
     assert left_out < 0.02

@@ -6,16 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from against_reference import MAPS, compare, maps_of
 from cameras import pinhole
-from dense_reference import DenseDiscs, dense_rasterize_discs
 from gsplat import DefaultStrategy
-from random_splats import NAMES, make_camera, make_splats, orbit
+from random_splats import make_camera, make_splats, orbit
 from torch import Tensor
 
-from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 
-MAPS = ("inverse_depth", "median_depth", "distortion")
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
@@ -25,43 +23,6 @@ def near_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
     means[:] = (means - torch.tensor([0.0, 0.0, 2.9])) * 0.4
     scales[:, :2] = scales[:, :2].clamp(max=1.0) * 3
     return [means, quats, scales, opacities, features]
-
-
-def maps_of(render: DenseDiscs | dict) -> list[Tensor]:
-    return [render[name] if isinstance(render, dict) else getattr(render, name) for name in MAPS]
-
-
-def differentiate(splats: list[Tensor], channels: Tensor, counted: Tensor, means2d: Tensor) -> dict:
-    """Gradients of a random linear function of the counted pixels."""
-    generator = torch.Generator().manual_seed(5)
-    slope = torch.randn(channels.shape, generator=generator, dtype=torch.float64).to(channels)
-    (channels * slope)[counted].sum().backward()
-    assert means2d.grad is not None
-    gradients = {name: splat.grad for name, splat in zip(NAMES, splats, strict=True)}
-    return {**gradients, "means2d": means2d.grad.view(-1, 2)}
-
-
-def compare(splats: list[Tensor], camera: Camera, dtype: torch.dtype, margin: float) -> tuple[float, dict, float]:
-    """Largest error of the values, relative error of each gradient, and share of pixels left out.
-
-    A pixel is left out if a decision is within ``margin`` of its threshold.
-    """
-    splats = [splat.requires_grad_() for splat in splats]
-    view = dict(viewmat=camera.viewmat, K=camera.K, width=camera.width, height=camera.height)
-    reference = dense_rasterize_discs(*splats, **view)
-    counted = reference.margin > margin
-    wanted = torch.cat([reference.composited, reference.alpha, *maps_of(reference)], dim=-1)
-    expected = differentiate(splats, wanted, counted, reference.means2d)
-
-    own = [splat.detach().to(dtype).requires_grad_() for splat in splats]
-    composited, alpha, info = rasterize(*own, camera=camera, primitive="2d")
-    info["gradient_2dgs"].retain_grad()
-    got = torch.cat([composited, alpha, *maps_of(info)], dim=-1)
-    assert got.dtype == dtype
-    assert got.shape == wanted.shape
-    actual = differentiate(own, got, counted, info["gradient_2dgs"])
-    relative = {k: ((actual[k] - expected[k]).norm() / expected[k].norm()).item() for k in expected}
-    return (got - wanted)[counted].abs().max().item(), relative, 1 - float(counted.double().mean())
 
 
 @pytest.mark.parametrize(
@@ -76,7 +37,7 @@ def compare(splats: list[Tensor], camera: Camera, dtype: torch.dtype, margin: fl
 )
 def test_values_and_gradients_match_the_reference_in_float64(make, n, width, height, n_features, seed):
     error, relative, left_out = compare(
-        make(n, n_features, seed), make_camera(width, height), torch.float64, margin=1e-10
+        make(n, n_features, seed), make_camera(width, height), torch.float64, margin=1e-10, primitive="2d"
     )
     assert error < 1e-6
     assert max(relative.values()) < 1e-5, relative
@@ -88,7 +49,7 @@ def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
     if compiled:
         request.getfixturevalue("compiler")
     splats, camera = make_splats(100, 3, seed=1), make_camera(53, 38)
-    error, relative, left_out = compare(splats, camera, torch.float32, margin=1e-4)
+    error, relative, left_out = compare(splats, camera, torch.float32, margin=1e-4, primitive="2d")
     assert error < 1e-4
     assert max(relative.values()) < 1e-3, relative
     assert left_out < 0.02
