@@ -241,7 +241,7 @@ def _tell_of_copies(recording: Recording, held_out: Sequence[int], config: Facad
         one, other = min(both.items())
         notice(
             f"{len(both)} of {len(held)} held-out photographs of {config.data} are copies of others that are trained "
-            f"on ({one} of {other}, for example): metrics of these are too good; take one of the two out of the scene."
+            f"on ({one} of {other}, for example): their metrics are too good; remove one of the two from the scene."
         )
 
 
@@ -259,7 +259,7 @@ def _of_block(
 def _of_cell(cell: Cell, recording: Recording, of_split: list[int], split: str, path: Path) -> list[int]:
     name, listed = cell.block.name, set(cell.block.photographs)
     if unknown := sorted(listed - {frame.name for frame in recording.frames}):
-        raise SceneError(f"{path}: {name} has {unknown[0]}, which is no photograph of the scene: take it out")
+        raise SceneError(f"{path}: {name} has {unknown[0]}, which is not a photograph of the scene: remove it")
     if not (chosen := [k for k in of_split if recording.frames[k].name in listed]):
         what = "to train on" if split == "train" else "that is held out"
         raise SceneError(f"{path}: {name} has no photograph {what}: add one to it, or join it with a neighbour")
@@ -285,7 +285,7 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     known, cells = blocks.cameras.cameras, blocks.cells
     if known and (added := [frame.name for frame in recording.frames if frame.name not in known]):
         raise SceneError(
-            f"{path} knows nothing of {len(added)} of the scene's {len(recording.frames)} photographs, such as "
+            f"{path} does not list {len(added)} of the scene's {len(recording.frames)} photographs, such as "
             f"{added[0]}: run `shellgs blocks {config.data}` again"
         )
     for split in ("train", "test"):
@@ -304,7 +304,7 @@ def _used(recording: Recording, split: str, config: FacadeDataParserConfig) -> l
     if left_out := [recording.frames[k].name for k in used if recording.frames[k].name in wrong]:
         notice(
             f"{len(left_out)} of {len(used)} photographs of {scene} are not trained on, as their cameras are wrong: "
-            f"{_some(left_out)}. To train on one all the same, take it out of {scene / DISPLACED}."
+            f"{_some(left_out)}. To use one anyway, remove it from {scene / DISPLACED}."
         )
     return [k for k in used if recording.frames[k].name not in wrong]
 
@@ -317,7 +317,7 @@ def _on_disk(frames: Sequence[Frame], used: Sequence[int], scene: Path) -> list[
         what = f"{len(missing)} of {len(used)} images of the cameras in {scene} are not on disk"
         if len(missing) > max(1, TAKEN_OUT * len(used)):
             raise FileNotFoundError(
-                f"{what} ({_some(missing)}); put them back, take them out of the model, or name their folder with "
+                f"{what} ({_some(missing)}); put them back, remove them from the model, or name their folder with "
                 "--images-path."
             )
         notice(f"{what}, and are left out: {_some(missing)}.")

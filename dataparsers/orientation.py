@@ -51,10 +51,13 @@ def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
     if applied is None:
         applied, by = _by_axes(marked, [v for v in there if _orientation(v.image) == 1]), "the cameras' up axes"
     shown = (
-        f"{len(marked)} photographs of {layout.data} are stored turned, by their EXIF ({marked[0].name}, for example)"
+        f"{len(marked)} photographs of {layout.data} are stored rotated, according to EXIF ({marked[0].name}, "
+        "for example)"
     )
     if applied is None:
-        notice(f"{shown}; nothing tells whether their cameras are of the upright ones: they are taken as stored.")
+        notice(
+            f"{shown}; whether their cameras are those of the upright photographs is unknown: they are used as stored."
+        )
     else:
         notice(f"{shown}; their cameras are of them {'upright' if applied else 'as stored'}, by {by}.")
     names = {view.name for view in marked} if applied else set()

@@ -168,7 +168,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         if checked and compared_others(checked, views, held_out_names(scene)):
             notice(
                 f"photographs of {scene.data}, their cameras, or which are held out have changed since they were "
-                f"compared with the shell, which counts as before: run `{checked.command}`, to compare them again."
+                f"compared with the shell, and the old comparison is used: run `{checked.command}`, to compare them "
+                "again."
             )
         if mono and (replaced := Fits.open(mono).replaced(views)):
             notice(
@@ -258,7 +259,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         if coloured:
             notice(
                 f"the SfM points of {self.config.dataparser.data} have other colours than the photographs, by "
-                f"{255 * apart:.0f} of 255 in the median: Gaussians begin with the photographs'."
+                f"{255 * apart:.0f} of 255 in the median: Gaussians start with the photographs' colours."
             )
         colours = shown(range(len(dataset)))
         return torch.from_numpy(np.where(np.isfinite(colours), colours, np.nanmedian(colours, axis=0))).float()

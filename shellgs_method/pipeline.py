@@ -88,9 +88,9 @@ class FacadePipeline(VanillaPipeline):
         data, gains = self.datamanager, None
         if self.model.config.trust == "photographs" and (names := data.train_dataset.uncompared()):
             notice(
-                f"{len(names)} of the {len(data.train_dataset)} training views were not compared with the others, such "
-                f"as {names[0]}: the shell counts there, whatever they show, and trees before it cost image quality; "
-                f"run `{data.train_dataset.cues['shell'].command}`."
+                f"{len(names)} of the {len(data.train_dataset)} training views were not compared with the others, "
+                f"such as {names[0]}: the shell is trusted there, whatever they show, and trees in front of it cost "
+                f"image quality; run `{data.train_dataset.cues['shell'].command}`."
             )
         if self.model.config.coarse is not None:
             self._start_in_block(self.model.config.coarse)
@@ -176,8 +176,8 @@ class FacadePipeline(VanillaPipeline):
         count = len(ours.parameter)  # of the whole scene, where a block is trained
         if len(stored) != count or [*map(stem, trained_on)] not in ([], names):
             raise SceneError(
-                f"the checkpoint has exposures of {len(stored)} photographs, which are not the {count} that the scene "
-                "has to train on: train on the same photographs, or anew"
+                f"the checkpoint has exposures of {len(stored)} photographs, which are not the {count} that the "
+                "scene has to train on: train on the same photographs, or start again"
             )
 
     def _tell_of_held_out(self, trained_on: Sequence[str]) -> None:
@@ -187,7 +187,8 @@ class FacadePipeline(VanillaPipeline):
         if known := [view.name for view in data.eval_dataset.views if stem(view.name) in trained]:
             notice(
                 f"{len(known)} of the held-out photographs, {known[0]} for example, were trained on until this "
-                "checkpoint, and their metrics will be too good: hold out those that it had held out, or train anew."
+                "checkpoint, and their metrics will be too good: hold out the same photographs as then, or train "
+                "again."
             )
 
     def _find_exposures(self, trained_on: Sequence[str]) -> None:
@@ -236,7 +237,7 @@ class FacadePipeline(VanillaPipeline):
             )
         block = state.get("block") or {}
         if self.test_mode != "val" and block and block["region"] != self._cell().fingerprint:
-            raise SceneError(f"{block['name']} was cut anew since the run was trained: train it again")
+            raise SceneError(f"{block['name']} has been cut again since the run was trained: train it again")
 
     def restore_training(self) -> None:
         """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.
@@ -252,7 +253,7 @@ class FacadePipeline(VanillaPipeline):
         if (block := state.get("block", {})) != dict(self._block):
             raise SceneError(
                 f"the checkpoint is of {block.get('name', 'no block')}, as it was cut, and of the coarse run then; "
-                "one of them has changed: train anew"
+                "one of them has changed: train again"
             )
         data, model = self.datamanager, self.model
         try:

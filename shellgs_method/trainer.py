@@ -319,7 +319,7 @@ class FacadeTrainer(Trainer):
             return
         check_method(path, self.config.method_name)
         parsed = self.pipeline.datamanager.train_dataparser_outputs
-        check_world(path.absolute().parents[1], parsed, "--data, or train anew")
+        check_world(path.absolute().parents[1], parsed, "--data, or train again")
         state = load_checkpoint(path)
         try:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])

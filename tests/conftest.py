@@ -54,7 +54,7 @@ def in_process(capsys, monkeypatch) -> Callable[..., str]:
         except SystemExit as stop:
             if stop.code:
                 return f"refused: {stop}"
-        return capsys.readouterr().out.replace("\n", " ")
+        return capsys.readouterr().out.replace(" \n", " ").replace("\n", " ")
 
     return command
 

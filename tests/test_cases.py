@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.skipif(not CASES.is_dir(), reason=f"no cases in {CASES}; set SHELLGS_CASES to their folder"),
 ]
 
-WORKS = r"views cast|Verdict: (good|doubtful)|confirm what is green|Printing profiling stats|difference \d"
+WORKS = r"views cast|Verdict: (good|doubtful)|green is confirmed|Printing profiling stats|difference \d"
 """What a command says that went through."""
 MOVED = """
 import importlib, importlib.abc, importlib.util, sys
@@ -89,7 +89,7 @@ RIGHT: dict[str, dict[str, str | float]] = {
     "12-heic": {
         # Read, and too small for SfM, or nearly.
         "(allheic|mixed) ": r"cameras of only \d of 10 photographs were found|[6-9] of 10 photographs registered"
-        r"|show too little to find cameras by",
+        r"|show too few points to find their cameras",
         "raw": refused("are raw photographs"),
         "videos": refused("there are no photographs"),
     },

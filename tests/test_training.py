@@ -392,7 +392,7 @@ def test_a_run_is_not_resumed_over_other_cameras(pristine_scene, tmp_path):
         for row in frame["transform_matrix"][:3]:
             row[3] *= 2  # as of structure from motion that was made again
     path.write_text(json.dumps(cameras))
-    with pytest.raises(SystemExit, match=r"is not the scene that the run .*: correct --data, or train anew"):
+    with pytest.raises(SystemExit, match=r"is not the scene that the run .*: correct --data, or train again"):
         trainer_of(scene, tmp_path / "second", "photo_gs", 6, first.checkpoint_dir)
 
 

@@ -98,7 +98,7 @@ class BlockRun:
                 "again"
             )
         if block.get("region") != cell.fingerprint:
-            raise SceneError(f"{self.name} was cut anew since its run {self.folder} was trained: train it again")
+            raise SceneError(f"{self.name} has been cut again since its run {self.folder} was trained: train it again")
         if block.get("coarse") != coarse.hash:
             raise SceneError(
                 f"{self.folder} started from another coarse run than {self.coarse.parent}, or from this one before it "

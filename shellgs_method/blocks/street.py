@@ -78,7 +78,7 @@ class BlockJob(Run):
         if self.region not in {cell.fingerprint for cell in Blocks.read(plan).cells}:
             raise SceneError(f"{plan} has changed since the street began: run the same command again")
         if self.begun and recorded_settings(self.recorded).get("block") != self.region:
-            raise SceneError(f"{name} was cut anew since {self.folder} was trained: remove that folder")
+            raise SceneError(f"{name} has been cut again since {self.folder} was trained: remove that folder")
         super().settle()
         checkpoint = find_checkpoint(self.coarse / "nerfstudio_models")
         with atomic_contents(self.folder / COARSE) as folder:
@@ -177,8 +177,8 @@ def train(street: Street, launch: Launch) -> None:
         if failures := launch(unfinished):
             run, why = next(iter(failures.items()))
             raise SceneError(
-                f"{len(failures)} of {len(unfinished)} runs failed, the first is {run.label}; all of its output is in "
-                f"{run.folder / 'log.txt'}, and the same command goes on where it stopped:\n{why}"
+                f"{len(failures)} of {len(unfinished)} runs failed, the first is {run.label}; all of its output is "
+                f"in {run.folder / 'log.txt'}, and the same command resumes:\n{why}"
             )
 
 

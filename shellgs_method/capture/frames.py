@@ -78,15 +78,15 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                 before = small
                 if frame.interlaced_frame:
                     notice(
-                        f"{video} is interlaced: where it moves, every other line of a frame is interpolated, as it is "
-                        "of another moment; record it progressive (25p, not 50i) if you can."
+                        f"{video} is interlaced: where something moves, every other line of a frame is interpolated, "
+                        "since it was taken at another moment; record progressive video (25p, not 50i) if you can."
                     )
                 image = _upright(frame, transfer, aspect, (right, down, frame.width - right, frame.height - down))
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
     if held:
         notice(
-            f"{held} of {len(chosen)} frames of {video} show the same as the one before, where the picture stands "
-            "still, and are left out."
+            f"{held} of {len(chosen)} frames of {video} repeat the frame before, where the picture stands still, and "
+            "are left out."
         )
 
 
@@ -238,8 +238,8 @@ def _frames(container: av.container.InputContainer, stream: VideoStream) -> Iter
             damaged += 1
     if damaged:
         notice(
-            f"{damaged / packets:.1%} of the video {container.name} is damaged, and is left out: copy it again if you "
-            "have it whole."
+            f"{damaged / packets:.1%} of the video {container.name} is damaged, and is left out: copy it again if "
+            "you have an intact file."
         )
 
 
@@ -249,8 +249,8 @@ def _tell_of_a_cut(video: Path, stream: VideoStream, end: float) -> None:
     seconds = end - start
     if stream.container.format.name.startswith(_TIMED) and seconds < _WHOLE * whole:
         notice(
-            f"{video} ends after {seconds:.1f} of its {whole:.1f} seconds, as a copy that was cut off: copy it again "
-            "if you have it whole."
+            f"{video} ends after {seconds:.1f} of its {whole:.1f} seconds, like a truncated copy: copy it again if "
+            "you have the whole file."
         )
 
 

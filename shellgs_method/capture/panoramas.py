@@ -118,8 +118,8 @@ def video_says_panorama(video: Path) -> bool:
 
     if video.suffix.lower() in UNSTITCHED:
         raise SceneError(
-            f"{video} is what a 360° camera recorded, which is not stitched: export it as 360° video "
-            "(equirectangular, mp4) with the camera's program"
+            f"{video} is an unstitched recording of a 360° camera: export it as 360° video (equirectangular, mp4) "
+            "with the camera's program"
         )
     frame = first_frame(video)
     try:
@@ -133,7 +133,7 @@ def video_says_panorama(video: Path) -> bool:
     if kinds["SPHERICAL"] != _EQUIRECTANGULAR:
         raise SceneError(f"{video} is a 360° video, but not equirectangular: export it as that")
     if kinds.get("STEREO3D", _ONE_EYE) != _ONE_EYE:
-        raise SceneError(f"{video} is a 360° video for two eyes: export it for one (mono)")
+        raise SceneError(f"{video} is a stereo 360° video: export it as mono")
     return True
 
 
@@ -151,9 +151,9 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     sizes = {name: _size(folder / name) for name in names if name not in said}
     if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
         notice(
-            f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, have one side {_WIDE:g} times as "
-            "long as the other, or more: if they are panoramas, no camera fits them, and others are bent to them: "
-            "leave them out."
+            f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, have one side {_WIDE:g} times as long "
+            "as the other, or more: if they are panoramas, no camera fits them, and the other cameras are bent to "
+            "match them: leave them out."
         )
     twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
     found = set(said)
@@ -169,13 +169,13 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         if np.median([_seam(photograph) for photograph in some]) < _CLOSED:
             found.update(alike)
             notice(
-                f"{what} go on at the left where they end at the right: they are taken for panoramas of 360°. If they "
-                "are not: --camera-type perspective."
+                f"{what} continue at the left where they end at the right: they are taken for 360° panoramas. If "
+                "they are not: --camera-type perspective."
             )
         else:
             notice(
-                f"{what} are twice as wide as high, but do not go around: they are not taken for panoramas of 360°. If "
-                "they are: --camera-type equirectangular."
+                f"{what} are twice as wide as high, but their left and right edges differ: they are not taken for "
+                "360° panoramas. If they are: --camera-type equirectangular."
             )
     return sorted(found)
 
@@ -234,7 +234,7 @@ def add_faces(panorama: Path, folder: Path, name: str, size: int, interpolation:
         if image.width != 2 * image.height:
             raise SceneError(
                 f"{name} is {image.width}x{image.height} pixels, but a panorama of 360° by 180° is twice as wide as "
-                "high: export it whole, for one eye (mono) and as equirectangular"
+                "high: export it whole, as mono equirectangular"
             )
         pixels, exif, kind = np.asarray(image), exif_of(image), image.format
     for prefix, face in FACES.items():

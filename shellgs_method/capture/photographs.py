@@ -106,8 +106,9 @@ def masks_as_stored(photographs: Mapping[str, Path], masks: Mapping[str, Path]) 
             told.add(drawn.size == size)
     if upside_down and len(told) != 1:
         notice(
-            f"{len(upside_down)} photographs that have masks, {upside_down[0]} for example, are stored upside down or "
-            "mirrored, by their EXIF, and their masks are taken for upright. If they are not, turn the masks."
+            f"{len(upside_down)} photographs that have masks, {upside_down[0]} for example, are stored upside down "
+            "or mirrored, according to EXIF, and their masks are assumed to be upright. If they are not, rotate the "
+            "masks."
         )
     return told == {True}
 

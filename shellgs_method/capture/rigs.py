@@ -47,7 +47,7 @@ def tell_of_a_rig(names: Sequence[str]) -> None:
     if len(prefixes) > 1 and len(shots) >= LEAST_SHOTS and all(len(shot) == len(prefixes) for shot in shots.values()):
         notice(
             f"The folders {', '.join(prefix.rstrip('/') for prefix in prefixes)} hold photographs of the same names: "
-            "if cameras that are mounted together took those of a name at once, --cameras rig uses this."
+            "if cameras that are mounted together took those of the same name at the same time, use --cameras rig."
         )
 
 

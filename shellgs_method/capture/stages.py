@@ -85,7 +85,7 @@ def capture(
     if source.is_file() and source.suffix.lower() in PHOTOGRAPHS | RAW:
         raise SceneError(f"{source} is one photograph: give a folder of them, or a video")
     if scene.resolve().is_relative_to(source.resolve()):
-        raise SceneError(f"{scene} lies in the folder of the photographs, {source}: give a scene folder outside of it")
+        raise SceneError(f"{scene} lies in the folder of photographs, {source}: give a scene folder outside of it")
     for given in filter(None, (source, config.masks)):
         if given.resolve().is_relative_to((scene / CAPTURE).resolve()):  # whose folders are emptied
             raise SceneError(f"{given} lies in {scene / CAPTURE}, where the capture keeps its own files: move it out")
@@ -201,7 +201,7 @@ class _Capture:
             (folder / name).unlink()
         notice(
             f"{len(panoramas)} panoramas of 360° are cut into {len(FACES)} photographs each, of {size}x{size} "
-            "pixels; none looks down, where who holds the camera is."
+            "pixels; none looks down, at the person who holds the camera."
         )
 
     def _features(self) -> Path:
@@ -211,7 +211,7 @@ class _Capture:
         ordinary = [name for name in self.names if not is_face(name)]
         if self.config.cameras == "rig" and faces:
             raise SceneError(
-                "--cameras rig is for ordinary photographs, and panoramas are among these: capture them apart"
+                "--cameras rig is for ordinary photographs, and panoramas are among these: capture them separately"
             )
         if self.config.cameras == "auto":
             tell_of_a_rig(ordinary)
@@ -340,8 +340,8 @@ class _Capture:
             prefix, turned, moved = found["loose"]
             how = f"turned by {turned:.1f}° and moved by {moved:.1f} steps" if moved else "never found together"
             raise SceneError(
-                f"the cameras of {self.rig[0]} and {prefix} are not mounted together, or photographs of the same name "
-                f"were not taken at once: against each other, they are {how}. Try --cameras folder"
+                f"the cameras of {self.rig[0]} and {prefix} are not mounted together, or photographs of the same "
+                f"name were not taken at the same time: relative to each other, they are {how}. Try --cameras folder"
             )
         return found["models"]
 

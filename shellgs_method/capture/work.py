@@ -64,7 +64,7 @@ def refuse_foreign(folder: Path) -> None:
     shown = folder.is_dir() and any(not is_hidden(path.relative_to(folder)) for path in folder.iterdir())
     if shown and not (folder / _RECORD).exists():
         raise SceneError(
-            f"{folder} has files, but no {_RECORD}: it is not of a capture, which would replace them; move it away, or "
+            f"{folder} has files, but no {_RECORD}: no capture made it, and it would replace them; move it away, or "
             "give another scene folder"
         )
 

@@ -145,7 +145,7 @@ class _Start:
         if len(starts) > 1 or (starts and not self.shell) or (self.accept and (self.shell or starts)):
             raise SceneError(
                 "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to "
-                "validate what is there"
+                "validate the existing alignment"
             )
         if any(self.global_shift) and self.matrix is None:
             raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")

@@ -66,14 +66,14 @@ def blocks(
             if not cell.core(seen.in_scene).any():
                 raise SceneError(
                     f"{file}: no photograph shows anything between the cuts of {cell.block.name}: move them, or cut "
-                    "anew with --again"
+                    "again with --again"
                 )
             if (count := len(cell.block.photographs)) < WEAK:
                 raise SceneError(
-                    f"{file}: {cell.block.name} has {count} of the {WEAK} photographs that it needs: move its cuts, or "
-                    "cut anew with --again"
+                    f"{file}: {cell.block.name} has {count} of the {WEAK} photographs that it needs: move its cuts, "
+                    "or cut again with --again"
                 )
-        console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.")
+        console.print(f"The cuts and the overlap of {file} are kept; --again makes new cuts.")
     replace(found, cameras=BoundCameras.of(frames)).write(file)
     draw(file.with_suffix(".png"), found, seen, positions(view.camera for view in views))
     for cell in found.cells:
@@ -109,7 +109,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
         points = find_sparse_points(layout)
         if points.observed is None:
             raise SceneError(
-                f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
+                f"{scene} has neither maps of a shell nor tracks of its SfM points, which say what each photograph "
                 f"shows: align a shell, and run `shellgs cast {shlex.quote(str(scene))}` first"
             )
         shown = tracked(points, positions(view.camera for view in views).mean(axis=0))

@@ -149,8 +149,8 @@ def _cast_shell(
     if summary.supported < SELDOM:
         hint = frame_of_matrix(config) if matrix else ""
         warn(
-            f"Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
-            f"{f'; {hint}' if hint else ''}.",
+            "Hardly any pixel shows the shell: is its alignment right? `shellgs align` validates "
+            f"that{f'; {hint}' if hint else ''}.",
         )
     if placed.mesh.meshing and (through := seen_through(scene, views)) > HOLES:
         poisson = f"`shellgs align {shlex.quote(str(scene))} … --mesher poisson` closes most"
@@ -182,7 +182,9 @@ def _cast_truth(
     if (scene / ALIGNMENT).is_file():
         of_shell = {content_hash(path) for path in Alignment.load(scene / ALIGNMENT).files(scene) if path.is_file()}
         if same := [path for path in alignment.files(scene) if path.is_file() and content_hash(path) in of_shell]:
-            raise SceneError(f"{same[0]} is the shell itself, and proves nothing: give a scan that was held apart")
+            raise SceneError(
+                f"{same[0]} is the shell itself, which proves nothing: give a scan that is not part of the shell"
+            )
     placed = PlacedShell.load(scene, views, alignment)
     in_its_system(alignment, placed.mesh).record(scene / TRUTH, views)
     size = max_image_size or shell.manifest.max_image_size
@@ -192,13 +194,13 @@ def _cast_truth(
     covered, apart = truth_coverage(scene, held_out)
     metres = apart * alignment.metres_per_unit
     console.print(
-        f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the truth "
-        f"covers {covered:.0%} of the shell in the {len(held_out)} held-out views, and metrics leave out the rest. "
-        f"In the median, the two are {metres:.3f} m apart there."
+        f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the "
+        f"ground truth covers {covered:.0%} of the shell in the {len(held_out)} held-out views, and metrics leave "
+        f"out the rest. In the median, the two are {metres:.3f} m apart there."
     )
     if covered < LITTLE or not metres < FAR_OFF:
-        warn("Is it of this building, and in the shell's frame? Look before you believe its metrics.")
-    console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
+        warn("Check that it shows this building, in the shell's frame, before you trust its metrics.")
+    console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: grey has no ground truth.")
 
 
 def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], unit: float, crs: str | None) -> str:
@@ -225,13 +227,13 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     if (displaced := Displaced.read(scene)).pixels:
         name, pixels = displaced.farthest
         few = (
-            "Their cameras are wrong, or are those of other photographs, unless something hides most of the building "
-            "there, such as a house that the shell lacks: they are not trained on. Find their cameras anew, or take "
-            f"those that are right out of {scene / DISPLACED}."
+            "Their cameras are wrong, or are those of other photographs, unless something that the shell lacks, "
+            "such as another house, hides most of the building there. They are not trained on: find their cameras "
+            f"again, or remove those that are right from {scene / DISPLACED}."
         )
         if measured := displaced.wrong & held_out:
-            few += f" What is measured in those that are held out, such as {min(measured)}, says nothing of a method."
-        many = "As they are many, the shell may not stand where it is built: look at the alignment's report."
+            few += f" Metrics in those that are held out, such as {min(measured)}, say nothing about a method."
+        many = "There are so many that the shell may be in the wrong place: look at the alignment's report."
         warn(
             "Photographs that do not show the building where the others and their own cameras put it: "
             f"{len(displaced.pixels)}, {name} by {pixels:.0f} pixels, for example. {few if displaced.wrong else many}"
@@ -241,9 +243,8 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     _tell_of_verdicts(verdicts, places)
     panel = _save_check_panel(scene, views)
     console.print(
-        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background, orange "
-        "what is behind a wall, magenta what windows show behind it, cyan where it is doubted; they confirm what is "
-        "green."
+        f"Look at {panel}: red is in front of the shell, blue moved, yellow is background, orange is behind a wall, "
+        "magenta is behind the shell, as in windows, cyan is doubtful, green is confirmed."
     )
 
 
@@ -253,15 +254,15 @@ def _tell_of_verdicts(verdicts: Verdicts, places: Path) -> None:
 
     if verdicts.before.share > 0:
         console.print(
-            f"{verdicts.before.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those "
-            f"that see it: look at {verdicts.views[verdicts.before.witness]}, and at {places}, red where the building "
-            "differs."
+            f"{verdicts.before.share:.1%} of the shell is contradicted by {MANY} or more photographs and at least "
+            f"half of those that see it: look at {verdicts.views[verdicts.before.witness]}, and at {places}, red "
+            "where the building differs."
         )
     if verdicts.behind.share > GLASS:
         warn(
             f"Behind {verdicts.behind.share:.1%} of the shell, as many photographs show something else: look at "
-            f"{verdicts.views[verdicts.behind.witness]}, and at {places}, magenta there. If that is no glass, the "
-            "building lacks this part of the shell, or stands back: take it out of the shell.",
+            f"{verdicts.views[verdicts.behind.witness]}, and at {places}, magenta there. If it is not glass, the "
+            "building lacks this part of the shell, or is set back: remove it from the shell.",
         )
     if verdicts.moved_in:
         console.print(
@@ -270,8 +271,8 @@ def _tell_of_verdicts(verdicts: Verdicts, places: Path) -> None:
         )
     if verdicts.unclear > UNCLEAR:
         warn(
-            f"Photographs tell little of {verdicts.unclear:.0%} of these pixels, as where they are dark or noisy: the "
-            "shell is doubted there, and supervises with less weight.",
+            f"Photographs neither confirm nor contradict {verdicts.unclear:.0%} of these pixels, as where they are "
+            "dark or noisy: the shell supervises with less weight there.",
         )
 
 

@@ -83,7 +83,7 @@ def pick(
             warn(f"{point['problem']}.", soft_wrap=True)
     fit = said["fit"]
     if "problem" in fit:
-        console.print(f"{picks}: {fit['problem']}. The same command goes on.", soft_wrap=True)
+        console.print(f"{picks}: {fit['problem']}. The same command continues.", soft_wrap=True)
         return
     words = [scene, *shell, "--picks", picks, *shell_words(metres_per_shell_unit, crs)]
     align = f"shellgs align {shlex.join(map(str, words))}{paths.flags}"

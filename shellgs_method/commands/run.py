@@ -148,7 +148,7 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
     words = *map(str, shell), *shell_words(recipe.metres_per_shell_unit, recipe.crs)
     pick = f"shellgs pick {named} {shlex.join(words)}"
-    remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and have --picks picks.txt"
+    remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and add --picks picks.txt"
     try:
         if not done.has("align", key) or not _is_there(written, scene):
             align(
@@ -179,10 +179,10 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
         open_page(report)
         state, right = "a proposal" if proposed else "doubtful", f"the images in {report} agree"
         if likelier := aligned.metrics.get(LIKELIER):
-            right, remedy = f"{right} and its unit is right", f"have --metres-per-shell-unit {likelier:g}, or {remedy}"
+            right, remedy = f"{right} and its unit is right", f"add --metres-per-shell-unit {likelier:g}, or {remedy}"
         raise SceneError(
-            f"the alignment is {state}: if {right}, go on with `shellgs run --scene {named} --accept`; else {remedy} "
-            f"in {scene}.run"
+            f"the alignment is {state}: if {right}, continue with `shellgs run --scene {named} --accept`; else "
+            f"{remedy} in {scene}.run"
         )
 
 
@@ -207,7 +207,7 @@ def _train(recipe: Recipe, scene: Path, results: Path, done: Record) -> Run:
     except OtherSettingsError:
         aside = next(path for k in count(1) if not (path := results / f"runs-{k}").exists())
         (results / "runs").rename(aside)
-        console.print(f"What was trained with other settings or maps is now in {aside}.")
+        console.print(f"Runs with other settings or maps are now in {aside}.")
     except DamagedRunError:  # which is told below
         pass
     truth = scene / "cues/truth/manifest.json"

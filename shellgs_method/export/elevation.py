@@ -99,7 +99,7 @@ def shell_and_walls(run: TrainedRun) -> tuple[Triangles, list[Wall]]:
         SceneError: there is no shell, or no upright surface of it is seen.
     """
     if run.shell is None:
-        raise SceneError("an elevation needs the aligned shell, which says what is upright and how long a metre is")
+        raise SceneError("an elevation needs the aligned shell, which gives the vertical and the length of a metre")
     shell = run.shell_in_frame
     cameras = [run.frame.camera(view.camera) for view in run.photographs]
     surface, _ = outward(Triangles(shell.vertices, shell.faces), positions(cameras))
@@ -254,8 +254,8 @@ def _drawings(elevation: Elevation) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
     near, far = np.percentile(elevation.surface[known], [1, 99]) if known.any() else (0.0, 1.0)
     return {
         "colours": elevation.colours,
-        f"depth, {near:.2f} to {far:.2f} m before the wall": depth_colours(elevation.surface, known, near, far),
-        f"deviations from the shell, red: {100 * FULL:g} cm before it, blue: behind it": deviation_colours(
+        f"depth, {near:.2f} to {far:.2f} m in front of the wall": depth_colours(elevation.surface, known, near, far),
+        f"deviations from the shell, red: {100 * FULL:g} cm in front of it, blue: behind it": deviation_colours(
             elevation.deviations, FULL
         ),
     }

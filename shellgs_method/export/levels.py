@@ -84,7 +84,7 @@ class Level:
             count = len(level.splats)
             count = min(count - 1, int(0.995 * count * (most - empty) / (taken - empty)))
             if count < 1:
-                raise SceneError(f"no Gaussian fits into {megabytes:g} MB: give --megabytes more")
+                raise SceneError(f"no Gaussian fits into {megabytes:g} MB: give a larger --megabytes")
             level = level.reduced(count)
         return level
 

@@ -71,7 +71,9 @@ class TrainedRun:
         settings, pipeline, checkpoint = load_run(config, "inference")
         done, all_of = 1 + int(checkpoint.stem.removeprefix("step-")), settings.max_num_iterations
         if done < all_of:
-            notice(f"{config.parent} was trained for {done} of {all_of} iterations: it was stopped, or is going on.")
+            notice(
+                f"{config.parent} was trained for {done} of {all_of} iterations: it was stopped, or is still running."
+            )
         elif done < SHORT:
             notice(f"{config.parent} was trained for {done} iterations only: give it {SHORT} or more.")
         model, datamanager = pipeline.model, pipeline.datamanager

@@ -73,8 +73,8 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
         raise SceneError(f"{path} holds no points")
     if len(points) > MOST:
         raise SceneError(
-            f"{path} holds {len(points)} points, and pairs of at most {MOST} are compared: cast a scan that was "
-            "held apart with `shellgs cast --truth`, and metrics are against it"
+            f"{path} holds {len(points)} points, and pairs of at most {MOST} are compared: to measure against a "
+            "scan, cast it with `shellgs cast --truth`"
         )
     return dict(zip(points, convert(np.stack([*points.values()])), strict=True))
 

@@ -168,7 +168,7 @@ class Blocks:
         """
         if changed := self.cameras.changed(frames):
             raise SceneError(
-                f"{path}: the cameras of the scene have changed since it was cut: {changed}; cut it anew with "
+                f"{path}: the cameras of the scene have changed since it was cut: {changed}; cut it again with "
                 f"`shellgs blocks {path.parent} --again`"
             )
 
@@ -204,7 +204,7 @@ class Blocks:
             blocks = cls(tree, _number(_item(contents, "overlap", "it"), "overlap"), cameras)
         except (TypeError, ValueError, RecursionError) as error:
             why = "its tree is too deep" if isinstance(error, RecursionError) else error
-            raise SceneError(f"{path} is damaged: {why}; mend it, or remove it and cut anew") from error
+            raise SceneError(f"{path} is damaged: {why}; correct it, or remove it and cut again") from error
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:
             raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")

@@ -167,7 +167,7 @@ def find_folder(scene: Path, chosen: Path | None) -> Path | None:
     others = ", ".join(f"{folder} has {size}" for folder, size in sizes.items() if folder != largest)
     notice(
         f"{scene} holds {len(models)} COLMAP models: {largest}, the largest, is used, with {sizes[largest]} "
-        f"photographs ({others}); another can be chosen by --colmap-path."
+        f"photographs ({others}); choose another with --colmap-path."
     )
     return largest
 
@@ -334,7 +334,7 @@ def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable
             file = _Bytes(path.read_bytes())
             read = binary(file)
             if file.at != len(file.data):
-                raise ValueError(f"it goes on for {len(file.data) - file.at} bytes after its last entry")
+                raise ValueError(f"it continues for {len(file.data) - file.at} bytes after its last entry")
             return read
         lines = map(str.strip, path.read_text(encoding_of(path), errors="surrogateescape").splitlines())
         return text(with_nan(line) for line in lines if line and not line.startswith("#"))
@@ -394,8 +394,8 @@ def _binary_cameras(file: _Bytes) -> dict[int, ColmapCamera]:
         number, model, width, height = file.take("<iiQQ")
         if not 0 <= model < len(_MODELS):
             raise SceneError(
-                f"its camera {number} has a model of the number {model}, which is unknown here: if it is not damaged "
-                f"but of a newer COLMAP or another program, {UNDISTORT}"
+                f"its camera {number} has the unknown model number {model}: if it is not damaged but from a newer "
+                f"COLMAP or another program, {UNDISTORT}"
             )
         name = list(_MODELS)[model]
         count = _PARAMETERS[name]

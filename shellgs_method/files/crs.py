@@ -104,8 +104,8 @@ def crs_there(system: str, place: Float64[np.ndarray, " 3"], metres: float) -> s
     if within(crs, conversion(crs, crs.geodetic_crs)(point), beyond)[0]:
         return system
     notice(
-        f"The shell is said to be in {crs.name}, but {place[0]:.0f} {place[1]:.0f} is outside its area: results are "
-        "not said to be in it. If an offset was taken from the shell (of *_offset.xyz, for example), add it; if "
+        f"The shell is declared to be in {crs.name}, but {place[0]:.0f} {place[1]:.0f} is outside its area: results "
+        "do not name it. If an offset was subtracted from the shell (that in *_offset.xyz, for example), add it; if "
         "another system is meant, name that with --crs."
     )
     return ""
@@ -189,15 +189,15 @@ def _tell_of_accuracy(operation: Transformer, what: str) -> None:
 
     with suppress(ProjError):  # it had no choice of operations
         operation = operation.get_last_used_operation()
-    better = "with PROJ_NETWORK=ON it fetches what there is"
+    better = "with PROJ_NETWORK=ON it downloads the grids that exist"
     if "ballpark vertical" in operation.description.lower():
         notice(
-            f"{what}, but not their heights, for which PROJ has no grid here: between the ellipsoid and the sea there "
-            f"are up to 100 m; {better}."
+            f"{what}, but not their heights, for which PROJ has no grid here: heights above the ellipsoid and above "
+            f"the sea differ by up to 100 m; {better}."
         )
     elif not 0 <= operation.accuracy <= _EXACT:
         known = f"to {operation.accuracy:g} m" if operation.accuracy > 0 else "without a known accuracy"
-        notice(f"{what} {known}, as far as PROJ knows here, by which all of them may be off together; {better}.")
+        notice(f"{what} {known}, as far as PROJ knows here; all of them may be off together; {better}.")
 
 
 def within(crs: CRS, degrees: np.ndarray, beyond: float = 0.0) -> Bool[np.ndarray, " N"]:

@@ -170,7 +170,8 @@ def _tell_of_far(frames: Sequence[Frame], where: str) -> None:
     if names := [frame.name for frame, away in zip(frames, far, strict=True) if away and frame.image.is_file()]:
         notice(
             f"{where} has {len(names)} of {len(frames)} cameras far from all others, that of {names[0]} for example, "
-            "as where structure from motion went wrong: move these photographs away, unless they were taken from there."
+            "probably placed wrongly by structure from motion: move these photographs away, unless they were taken "
+            "from there."
         )
 
 

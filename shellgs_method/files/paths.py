@@ -116,8 +116,8 @@ class NamedFiles:
                 return path
         if name != _without_bytes(name):
             raise SceneError(
-                f"{where} names the file {name!r}, whose letters are not UTF-8, and none here fits: use plain letters "
-                "in the photographs' names, and find the cameras again"
+                f"{where} names the file {name!r}, which is not UTF-8, and matches none here: use plain letters in "
+                "the photographs' names, and find the cameras again"
             )
         return written or inside(self.scene, name, where)
 

@@ -301,8 +301,8 @@ def tell_of_borders(photographs: Sequence[Shown], scene: Path) -> None:
     same = [each for each in black if each.shape == black[0].shape]
     if len(same) >= _FEW and (share := np.logical_and.reduce(same).mean()) > _BORDERED:
         notice(
-            f"the photographs of {scene} are black in the same {share:.1%} of their pixels, as in borders of programs "
-            "that undistort, or in a time stamp, which are trained on as a part of the scene: mask them."
+            f"the photographs of {scene} are black in the same {share:.1%} of their pixels, like the borders of "
+            "undistorted photographs or a time stamp, which are trained as a part of the scene: mask them."
         )
 
 
@@ -374,13 +374,13 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     except Exception as error:  # each decoder raises its own errors for a damaged file
         if isinstance(error, UnidentifiedImageError) and path.suffix.lower() in (".tif", ".tiff"):
             raise SceneError(
-                f"{path} is a TIFF of a kind that is not read, of floating-point numbers for example, or cut off: save "
-                "it in RGB of 8 or 16 bits, or put the whole file back"
+                f"{path} is a TIFF of a kind that is not read, such as floating-point numbers, or truncated: save it "
+                "in RGB of 8 or 16 bits, or put the whole file back"
             ) from error
         reason = " ".join(str(error).split())
         if path.suffix.lower() in _OTHERS:
             raise SceneError(
-                f"{path} is of a format of photographs that is not read: save it as JPEG, or as PNG or TIFF of 8 or "
+                f"{path} is in a format that is not read as a photograph: save it as JPEG, or as PNG or TIFF of 8 or "
                 "16 bits"
             ) from error
         raise SceneError(

@@ -110,8 +110,9 @@ class SceneLayout(ScenePaths):
         held_out = recording.listed.get("val", set()) | recording.listed.get("test", set())
         if both := held_out & recording.listed.get("train", set()):
             notice(
-                f"{len(both)} of {len(held_out)} held-out photographs of {self.data} are trained on as well, by its "
-                f"lists: {min(both)}, for example; metrics of these are too good: take them out of train_filenames."
+                f"{len(both)} of {len(held_out)} held-out photographs of {self.data} are trained on as well, "
+                f"according to its lists: {min(both)}, for example; their metrics are too good: remove them from "
+                "train_filenames."
             )
 
     def colmap_folder(self) -> Path | None:
@@ -169,8 +170,9 @@ class SceneLayout(ScenePaths):
             looked_in = [self.colmap_path] if self.colmap_path else ["the folder itself", *colmap.PLACES]
             raise FileNotFoundError(
                 f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
-                f"{', '.join(map(str, looked_in))}, or in numbered folders there; `shellgs capture` makes a scene of "
-                "photographs, `ns-process-data` of exports of Metashape, RealityScan, OpenDroneMap, Polycam or Record3D"
+                f"{', '.join(map(str, looked_in))}, or in numbered folders there; `shellgs capture` makes a scene "
+                "from photographs, `ns-process-data` from exports of Metashape, RealityScan, OpenDroneMap, Polycam "
+                "or Record3D"
             )
         return folder
 

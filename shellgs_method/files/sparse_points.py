@@ -137,7 +137,10 @@ def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
         warn_of_coarse(points.step, points.positions, f"the SfM points of {layout.data}")
     if points.colours is None or len(points.colours) == 0 or points.colours.any():
         return points
-    notice(f"{points.called} are all black, as if colours were not extracted: Gaussians begin with the photographs'.")
+    notice(
+        f"{points.called} are all black, as if colours were not extracted: Gaussians start with the photographs' "
+        "colours."
+    )
     return replace(points, colours=np.full_like(points.colours, transforms.GREY))
 
 
@@ -152,7 +155,7 @@ def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np
     again = _again(positions[near])
     if again.any():
         notice(
-            f"{again.sum()} of {len(positions)} SfM points of {layout.data} are where others are, as the corners of a "
+            f"{again.sum()} of {len(positions)} SfM points of {layout.data} duplicate others, like the corners of a "
             "mesh's triangles, and are left out."
         )
     return np.flatnonzero(near)[~again]

@@ -149,7 +149,7 @@ def encoded(
         return _ply(splats, comments)
     if suffix == ".glb":
         if _bytes_of_glb(splats) > _LARGEST_GLB - 2**16:
-            raise SceneError(f"{path} would have more than 4 GB, which no glb can: name a .ply")
+            raise SceneError(f"{path} would have more than the 4 GB of a glb: name a .ply")
         return _glb(splats, comments)
     spz = _spz(splats)
     return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views, background)
@@ -298,7 +298,7 @@ def _spz(splats: Splats) -> bytes:
     if cut := int((splats.scales > SPZ_LARGEST).any(dim=1).sum()):
         notice(
             f"{cut} Gaussians have standard deviations of more than {math.exp(SPZ_LARGEST):.0f} units, which spz and "
-            "pages cannot hold, and are cut to that: a .ply or .glb has them whole."
+            "pages cannot hold, and are cut to that: a .ply or .glb keeps them."
         )
     fixed = (splats.means.double() * 2**fraction).round().int().numpy().astype("<i4")
     positions = fixed.view("u1").reshape(len(fixed), 3, 4)[:, :, :3]

@@ -58,8 +58,8 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
         raise SceneError(f"{path} has no list of frames: make it again")
     if (scale := meta.get("applied_scale", 1)) != 1:
         notice(
-            f"{path} has an applied_scale of {scale}, which is not undone: poses and points are taken as they are "
-            "written, so that a --matrix must lead to these."
+            f"{path} has an applied_scale of {scale}, which is not undone: poses and points are used as they are "
+            "written, so a --matrix must map to these."
         )
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
     frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
@@ -99,8 +99,8 @@ def _tell_of_metashape(lenses: Sequence[Lens], path: Path) -> None:
         off = max(off, float(np.linalg.norm(distort_pixels(lens, corners, K) - exchanged, axis=1).max()))
     if off > 1:
         notice(
-            f"{path} was made of Metashape's cameras, whose p1 and p2 nerfstudio 1.1.5 takes for each other: if so, "
-            f"corners of the photographs are up to {off:.0f} pixels off. Exchange the two there, or export undistorted "
+            f"{path} was made from Metashape's cameras, whose p1 and p2 nerfstudio 1.1.5 exchanges: if so, corners "
+            f"of the photographs are up to {off:.0f} pixels off. Exchange the two there, or export undistorted "
             "photographs; nothing, if that is done."
         )
 
@@ -164,8 +164,8 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
     lens = for_all | own
     if other := [key for key in own if key in for_all and own[key] != for_all[key]]:
         notice(
-            f"{files.where} has frames with another {other[0]} than it gives for all, and theirs counts; nerfstudio's "
-            "own parsers take the one for all."
+            f"{files.where} has frames with another {other[0]} than it gives for all, and theirs is used; "
+            "nerfstudio's own parsers use the one for all."
         )
     fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
     if fisheye is True and "FISHEYE" not in str(lens.get("camera_model")).upper():  # instant-ngp's

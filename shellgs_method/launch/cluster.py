@@ -79,7 +79,7 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
         takes = cluster.per_run(nodes)
         if (lacking := takes.lacking(nodes)) and not cluster.address:
             raise SceneError(
-                f"a run takes {lacking}, which this machine has not: give less, or the --address of a cluster"
+                f"a run takes {lacking}, which this machine does not have: give less, or the --address of a cluster"
             )
         if lacking:
             console.print(f"No node has {lacking} now: runs wait until one joins the cluster.")

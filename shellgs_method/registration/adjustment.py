@@ -323,7 +323,7 @@ def _planes(
     near = tracks[close]
     if len(near) < FEW:
         raise SceneError(
-            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how "
+            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to determine how "
             "cameras are bent"
         )
     feet, normals = closest.point[close].astype(np.float64), surface.normals[closest.triangle[close]]

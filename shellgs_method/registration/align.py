@@ -235,8 +235,8 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter, picks)
     if adjustment.shifted > _ELSEWHERE:
         raise SceneError(
-            f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "
-            "no bend of cameras; align it better first, with --picks and --refine"
+            f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which "
+            "bent cameras do not explain; align it better first, with --picks and --refine"
         )
     held = adjustment.held_out
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
@@ -245,7 +245,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
             f"do not fit the shell better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are "
             "asked)"
             if held.points >= FEW
-            else f"are too few to tell ({FEW} are needed)"
+            else f"are too few to decide ({FEW} are needed)"
         )
         sentence = (
             f"The cameras are left as they are: {held.points} points near the shell, held out of their adjustment, "
@@ -300,8 +300,8 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     if tags is not None:
         off = tags.apart(best.survey_from_scene)
-        said = "" if off < REACH else ": it agrees with none, so look whether the building and --crs are the right ones"
-        history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m off it{said}.")
+        said = "" if off < REACH else ": it agrees with none, so check that the building and --crs are the right ones"
+        history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals
@@ -320,7 +320,7 @@ def up_in_words(alignment: Alignment) -> str:
     """What is up in the shell's file, by the cameras."""
     if alignment.up is None:
         usual = name_of(usual_up(alignment.shells))
-        return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
+        return f"The cameras do not determine which way is up: it is taken to be {usual} of the shell's file."
     return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 
 

@@ -66,9 +66,9 @@ def check_points(points: SparsePoints, views: Sequence[View], photographs: Seque
     if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE and drift <= _DRIFTED:
         if not alike >= _OWN and _are_others(points, photographs):
             notice(
-                f"{points.called} have other colours than the photographs that see them, as if these were others "
-                "than those of the model: if they are in another order, turned, cropped or others of these names, put "
-                "back those that the cameras were found with."
+                f"{points.called} have other colours than the photographs that see them, as if these were not the "
+                "photographs of the model: if they are in another order, rotated, cropped, or others with these "
+                "names, put back those that the cameras were found with."
             )
         if (share := _ignored(points, photographs)) > _MOSTLY:
             notice(
@@ -92,9 +92,9 @@ def check_points(points: SparsePoints, views: Sequence[View], photographs: Seque
         )
     if drift > _DRIFTED:
         notice(
-            f"{points.called} are not where the photographs show them, by their own tracks, but {drift:.1%} of a "
-            "photograph's side away in the median: cameras, images and points are of several models, or were changed "
-            "apart from each other; give the files of one."
+            f"{points.called} are not where their own keypoints show them, but {drift:.1%} of a photograph's side "
+            "away in the median: cameras, images and points are from several models, or were changed separately; "
+            "give the files of one."
         )
     elif (others := alike < _UNLIKE or _are_others(points, photographs)) or seen < _ALIKE:
         order = ", or the photographs in another order" if others else ""

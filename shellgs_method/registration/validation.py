@@ -64,8 +64,8 @@ LIMITS = {
     "pull": Limit(
         0.03,
         0.25,
-        "the shell is beside the SfM points: --refine moves it onto them; leave it where picks with small residuals "
-        "placed it, which tell more than points on frames and sills that it lacks",
+        "the shell is offset from the SfM points: --refine moves it onto them; leave it where picks with small "
+        "residuals placed it, which are more accurate than points on frames and sills that it lacks",
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
@@ -73,11 +73,11 @@ LIMITS = {
     "agreement": Limit(
         0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),
-    "elsewhere": Limit(0.8, 0.93, "where the shell stands as well elsewhere, neither place is proved"),
+    "elsewhere": Limit(0.8, 0.93, "if the shell fits as well elsewhere, neither place is certain"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
-    "bent_pixels": Limit(1.05, 1.2, "points that were not adjusted to fit worse if cameras are bent"),
-    "bent_check": Limit(0.02, 0.05, "check points that are farther off than before show that cameras are bent"),
+    "bent_pixels": Limit(1.05, 1.2, "held-out points fit worse if the adjustment bends the cameras"),
+    "bent_check": Limit(0.02, 0.05, "check points fit worse if the adjustment bends the cameras"),
 }
 """All thresholds of the verdict, with their reasons."""
 

@@ -42,8 +42,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
         which = "" if step is None else f" of step {step}"
         raise SceneError(
             f"{folder} holds no checkpoint{which} (step-*.ckpt): those of a run lie in nerfstudio_models beside its "
-            "config.yml, which --load-dir takes, and a run that was stopped before its first save has none: train it "
-            "anew"
+            "config.yml, which --load-dir takes, and a run that was stopped before its first save has none: train "
+            "it again"
         )
     return folder / f"step-{max(steps) if step is None else step:09d}.ckpt"
 

@@ -196,8 +196,8 @@ def _resume_from(config: TrainerConfig, given: TrainerConfig) -> None:
     folder = config.get_checkpoint_dir()
     if not (config.load_dir or config.load_checkpoint) and any(folder.glob("step-*.ckpt")):
         raise SceneError(
-            f"{folder} has checkpoints, which training anew would replace: resume with --load-dir {folder}, or start "
-            f"another run with `ns-train {config.method_name} --data {config.pipeline.datamanager.data}`"
+            f"{folder} has checkpoints, which training again would replace: resume with --load-dir {folder}, or "
+            f"start another run with `ns-train {config.method_name} --data {config.pipeline.datamanager.data}`"
         )
 
 

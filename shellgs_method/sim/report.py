@@ -125,7 +125,7 @@ def _metrics(world: Path, chapter: Chapter, ground: Ground, test: bool) -> tuple
         sentences += [str(walked), *(f"MuJoCo warns: {warning}" for warning in warnings)]
     if chapter.truth is not None:
         made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
-        sentences += [f"Lidar of the {name} against the truth: {text(e)}" for name, e in made["lidar"].items()]
+        sentences += [f"Lidar of the {name} against the ground truth: {text(e)}" for name, e in made["lidar"].items()]
     return made, sentences
 
 

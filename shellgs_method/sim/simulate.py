@@ -253,9 +253,9 @@ def _report_steps(made: Reconstruction, ground: Ground, log: Callable[[str], Non
     below = float(np.median(made.ground.at(made.eyes) - ground.at(made.eyes)))
     if abs(below) > STEP:
         log(
-            f"The ground of the world is {abs(below):.1f} m {'below' if below > 0 else 'above'} that before "
-            f"{made.scene}: the buildings stand at different heights, and only one street is measured. Export them one "
-            "by one."
+            f"The ground of the world is {abs(below):.1f} m {'below' if below > 0 else 'above'} that in front of "
+            f"{made.scene}: the buildings stand at different heights, and only one street is measured. Export them "
+            "one by one."
         )
 
 

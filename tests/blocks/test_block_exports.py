@@ -67,7 +67,7 @@ def test_a_block_that_was_cut_anew_is_not_exported(runs):
     before = (scene / BLOCKS).read_bytes()
     cut_in_two(scene, overlap=0.7)
     try:
-        with pytest.raises(SceneError, match="west was cut anew since the run was trained"):
+        with pytest.raises(SceneError, match="west has been cut again since the run was trained"):
             TrainedRun.load(config)
     finally:
         (scene / BLOCKS).write_bytes(before)

@@ -313,7 +313,7 @@ def test_photographs_that_were_added_since_a_scene_was_cut_are_not_left_out_of_a
     command(scene, length=6.0, overlap=1.0)
     assert len(trainable_cells(layout)) > 1
     cameras.write_text(whole)
-    with pytest.raises(SceneError, match=rf"nothing of 1 of the scene's 10 photographs, such as {added}: run"):
+    with pytest.raises(SceneError, match=rf"does not list 1 of the scene's 10 photographs, such as {added}: run"):
         trainable_cells(layout)
     command(scene)
     assert any(added in cell.block.photographs for cell in trainable_cells(layout))

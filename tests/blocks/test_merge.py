@@ -219,7 +219,7 @@ def test_gaussians_of_two_blocks_in_one_place_are_doubles_and_those_of_one_block
         ("twice", "3 runs of 2 blocks"),
         ("of the whole scene", "no run of a block"),
         ("unfinished", "6 of its 99 iterations"),
-        ("cut anew", "was cut anew"),
+        ("cut again", "has been cut again"),
         ("another coarse run", "another coarse run"),
         ("moved cameras", "cameras of .* have changed since .*: that of .*stood"),
         ("other settings", "has other settings than .*sh_degree"),
@@ -253,7 +253,7 @@ def test_what_cannot_be_merged_is_refused_in_a_sentence(configs, coarse, street,
                 for camera in extra["cameras"].values():
                     camera[9] += 0.1
             else:
-                extra["block"]["region" if broken == "cut anew" else "coarse"] = "another"
+                extra["block"]["region" if broken == "cut again" else "coarse"] = "another"
             torch.save(state, path)
     with pytest.raises(SceneError, match=said):
         merge(given, output)

@@ -90,7 +90,7 @@ def test_a_block_that_was_cut_anew_is_not_gone_on_with(cut, tmp_path):
         shutil.copytree(run.folder / "coarse" / "nerfstudio_models", run.checkpoints)
     assert len(script(planned(cut, tmp_path / "street"))) == 2
     cut_in_two(cut, overlap=0.7)
-    with pytest.raises(SceneError, match=r"west was cut anew since .* was trained: remove that folder"):
+    with pytest.raises(SceneError, match=r"west has been cut again since .* was trained: remove that folder"):
         script(planned(cut, tmp_path / "street"))
 
 
@@ -104,7 +104,7 @@ def test_a_plan_that_changes_while_a_street_is_trained_ends_it(cut, tmp_path):
 
 @pytest.mark.parametrize(
     ("photographs", "said"),
-    [((), "no photograph to train on"), (("nope.png",), "nope.png, which is no photograph"), (None, "has one block")],
+    [((), "no photograph to train on"), (("nope.png",), "nope.png, which is not"), (None, "has one block")],
 )
 def test_a_block_that_cannot_be_trained_is_refused_before_the_coarse_run(cut, tmp_path, photographs, said):
     blocks = Blocks.read(cut / BLOCKS)

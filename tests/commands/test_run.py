@@ -63,7 +63,7 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     assert mesh.stat().st_mtime_ns == written
     settings = Path("scene.run")
     settings.write_text(settings.read_text().replace("--iterations 3", "--iterations 2"))
-    assert "is now in scene-results/runs-1" in shellgs("run")
+    assert "are now in scene-results/runs-1" in shellgs("run")
     assert mesh.stat().st_mtime_ns != written
     settings.write_text(settings.read_text().replace("--method photo-gs", "--method shellgs"))
     assert "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
@@ -87,7 +87,7 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
     earlier.save(Path("scene") / ALIGNMENT)  # of another shell, perhaps: it must not pass for the proposal
     told = shellgs("run", photographs, shell, "--accept", "--crs", "EPSG:25832")
     assert "is a proposal: if the images in scene/shell/report/index.html agree" in told  # it was not seen yet
-    assert "shell.ply --crs EPSG:25832) and have --picks picks.txt" in told
+    assert "shell.ply --crs EPSG:25832) and add --picks picks.txt" in told
     assert Alignment.load(Path("scene") / ALIGNMENT) == earlier
     assert "is a proposal" in shellgs("run")
     assert calls == [False]  # not proposed again
@@ -127,8 +127,8 @@ def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs,
 
     monkeypatch.setattr(run_command, "align", align)
     told = shellgs("run", photographs, shell, "--matrix", matrix)
-    assert "index.html agree and its unit is right, go on with `shellgs run --scene scene --accept`" in told
-    assert "else have --metres-per-shell-unit 0.3048, or add --refine 0.3, or pick points" in told
+    assert "index.html agree and its unit is right, continue with `shellgs run --scene scene --accept`" in told
+    assert "else add --metres-per-shell-unit 0.3048, or add --refine 0.3, or pick points" in told
     with Path("scene.run").open("a") as settings:
         settings.write("--metres-per-shell-unit 0.3048")
     assert shellgs("run") == "refused: cast"

@@ -226,11 +226,11 @@ FEET = 1200 / 3937
 )
 def test_a_shell_that_is_not_in_the_area_of_its_system_is_not_said_to_be_in_it(caplog, system, place, metres, is_there):
     assert crs_there(system, np.array(place, float), metres) == (system if is_there else "")
-    assert ("outside its area: results are not said to be in it" in caplog.text) == (not is_there)
+    assert ("outside its area: results do not name it" in caplog.text) == (not is_there)
 
 
 def test_a_system_from_the_middle_of_the_earth_is_refused():
-    with pytest.raises(SceneError, match="counts from the middle of the Earth"):
+    with pytest.raises(SceneError, match="is geocentric"):
         metres_of("EPSG:4978", 1.0, (Path("scan.las"),))
 
 

@@ -152,7 +152,7 @@ def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
     (geometry,) = document["CityObjects"]["a"]["geometry"]
     geometry["semantics"]["surfaces"][5]["type"] = "ClosureSurface"  # the glazed window
     assert_cast_as(made.save_json(tmp_path / "a.json", document), [f for f in moved(house()) if f.surface != "Window"])
-    assert "left out what is no outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
+    assert "not on the outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
 
 
 @pytest.mark.parametrize("value", [-1, 999])
@@ -177,7 +177,7 @@ def test_a_roof_is_read_where_what_is_not_seen_has_its_outline(tmp_path: Path, i
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.update(type="FeatureCollection"), "is json, but no CityJSON"),
+        (lambda d: d.update(type="FeatureCollection"), "is json, but not CityJSON"),
         (lambda d: d.update(type=None, geometricError=500), "is a tileset of 3D Tiles, in the frame of the Earth"),
         (lambda d: d.update(type="FeatureCollection", features=[]), "is a GeoJSON, which has no walls"),
         (lambda d: d.update(version="0.9"), "is CityJSON 0.9: upgrade it"),
@@ -421,8 +421,8 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
     [
         (lambda text: text[: len(text) // 2], "may be cut off or damaged"),
         (lambda text: BOMB + text, "it declares a document type"),
-        (lambda text: text.replace("CityModel", "Model"), "is XML, but no CityGML"),
-        (lambda text: '<a:FeatureCollection xmlns:a="b"><a:member/></a:FeatureCollection>', "is XML, but no CityGML"),
+        (lambda text: text.replace("CityModel", "Model"), "is XML, but not CityGML"),
+        (lambda text: '<a:FeatureCollection xmlns:a="b"><a:member/></a:FeatureCollection>', "is XML, but not CityGML"),
         (lambda text: text.replace("410000.0 ", "", 1), "no positions of 3 coordinates"),
         (lambda text: text.replace("bldg:Building", "veg:PlantCover"), "has no surface of a building"),
     ],
@@ -640,7 +640,7 @@ def test_what_reinforces_concrete_is_left_out_of_every_ifc(tmp_path: Path, caplo
     file.block("IfcBeam", (0, 0, 0), (6, 0.3, 0.5))
     file.block("IfcReinforcingMesh", (0.1, 0.1, 0.1), (5.9, 0.2, 0.2))
     assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 12
-    assert "left out what is no outside of a building: 1 IfcReinforcingMesh" in caplog.text
+    assert "left out what is not on the outside of a building: 1 IfcReinforcingMesh" in caplog.text
 
 
 @pytest.mark.parametrize("beside_a_body", [True, False])
@@ -692,7 +692,7 @@ def test_a_shape_of_an_ifc_without_a_context_is_read_and_cuts(tmp_path: Path, ca
         for shape in product.Representation.Representations:
             shape.ContextOfItems = None
     assert_cast_as(file.save(tmp_path / "a.ifc"), made.ifc_house_faces())
-    assert "of its shapes have no context, against IFC" in caplog.text
+    assert "of its shapes have no context, which IFC requires" in caplog.text
 
 
 def test_parts_of_an_ifc_without_a_placement_are_told(tmp_path: Path, caplog):
@@ -700,7 +700,7 @@ def test_parts_of_an_ifc_without_a_placement_are_told(tmp_path: Path, caplog):
     wall = file.block("IfcWall", (0, 0, 0), (6, 0.3, 3))
     wall.ObjectPlacement = None
     assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 12
-    assert f"1 of 1 parts have a shape but no placement, against IFC, such as IfcWall {wall.GlobalId}" in caplog.text
+    assert f"parts have a shape but no placement, which IFC requires, such as IfcWall {wall.GlobalId}" in caplog.text
 
 
 def test_a_shape_of_an_ifc_without_items_is_said(tmp_path: Path, caplog):

@@ -73,7 +73,7 @@ def test_a_glb_of_more_bytes_than_its_header_counts_is_refused_before_it_is_made
     write_splats(tmp_path / "a.glb", splats)
     assert 0 <= (tmp_path / "a.glb").stat().st_size - files_splats._bytes_of_glb(splats) < 2**15
     monkeypatch.setattr(files_splats, "_LARGEST_GLB", 2**16 + 1000)
-    with pytest.raises(SceneError, match=r"more than 4 GB, which no glb can: name a \.ply"):
+    with pytest.raises(SceneError, match=r"more than the 4 GB of a glb: name a \.ply"):
         write_splats(tmp_path / "b.glb", splats)
 
 

@@ -439,7 +439,7 @@ PACKED = [f"property uint packed_{name}" for name in ("position", "rotation", "s
 )
 def test_splats_are_refused_as_a_shell(tmp_path: Path, name: str, header: list[str]):
     save_ply(tmp_path / name, ["element vertex 1", *header], bytes(64))
-    with pytest.raises(SceneError, match=r"holds Gaussian splats, which are no surface.*shellgs mesh"):
+    with pytest.raises(SceneError, match=r"holds Gaussian splats, which are not a surface.*shellgs mesh"):
         read_geometry(tmp_path / name)
 
 
@@ -597,7 +597,7 @@ def test_only_blanks_may_follow_the_triangles_of_a_binary_stl(tmp_path: Path):
     assert_same_surface(read_geometry(tmp_path / "a.stl"))
     for more in (data, b"ab"):
         (tmp_path / "a.stl").write_bytes(data + more)
-        with pytest.raises(SceneError, match=r"goes on for \d+ bytes after the 12 triangles"):
+        with pytest.raises(SceneError, match=r"continues for \d+ bytes after the 12 triangles"):
             read_geometry(tmp_path / "a.stl")
 
 

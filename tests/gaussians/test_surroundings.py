@@ -201,7 +201,7 @@ def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photo
         ("another primitive", "has primitive 3d, and this run 2d"),
         ("unfinished", "has 12 of its 99 iterations"),
         ("nothing held out", "no photograph that is held out"),
-        ("unknown photograph", "which is no photograph of the scene"),
+        ("unknown photograph", "which is not a photograph of the scene"),
         ("another scene", "is not the scene that the run"),
         ("others held out", "was trained on other photographs than .* from images/frame_0000[0-9]"),
         ("another camera of a rig", "was trained on other photographs than .* from images/frame_0000[0-9]"),

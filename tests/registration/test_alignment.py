@@ -316,7 +316,7 @@ def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
     twins = twins_of(mesh, 40)
     placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, unplaced("s.ply", crs="EPSG:25832"))
     assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
-    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
+    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m away from it\.", placement.history[1])
     assert not any("Ambiguous" in sentence for sentence in placement.history)
 
 
@@ -331,7 +331,7 @@ def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_pat
     for view, exif in zip(views, geo_tags(views, 3.0), strict=True):
         Image.open(view.image).save(view.image, exif=exif)
     told = shellgs("align", scene, scan, "--crs", "EPSG:25832")
-    assert re.search(r"10 photographs have geo-tags, in the median [1-6]\.\d m off it\.", told), told
+    assert re.search(r"10 photographs have geo-tags, in the median [1-6]\.\d m away from it\.", told), told
     assert "Ambiguous" not in told  # as it is without them: the other facade scores 100 %
     proposed = Alignment.load(scene / PROPOSAL)
     there = transformed(one.vertices, SHELL_FROM_BUILDING)

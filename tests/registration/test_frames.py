@@ -167,7 +167,7 @@ def test_points_at_their_keypoints_are_accepted_in_silence(points, views, caplog
         check_points(unseen, [replace(views[0], lens=of), *(replace(view, lens=lens) for view in views[1:])])
     assert not caplog.records
     check_points(bent, views)
-    assert "not where the photographs show them, by their own tracks, but" in caplog.text
+    assert "not where their own keypoints show them, but" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, view
     (scene / "transforms.json").unlink()
     layout = FacadeDataParserConfig(data=scene)
     check_points(find_sparse_points(layout), read_views(layout))
-    told = "sparse/0 are not where the photographs show them, by their own tracks" in caplog.text
+    told = "sparse/0 are not where their own keypoints show them" in caplog.text
     assert told == (shown not in ("keypoints of a script", "numbers of other keypoints"))
 
 

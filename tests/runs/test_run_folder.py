@@ -323,7 +323,9 @@ def test_a_run_with_checkpoints_is_not_trained_anew_over_them(two_projects, monk
     again.load_config = a / NAMES / "config.yml"
     (a / NAMES / LAST).touch()
     monkeypatch.setattr(train, "launch", lambda *_, **__: pytest.fail("training started"))
-    with pytest.raises(SystemExit, match=r"has checkpoints, which training anew would replace: resume with --load-dir"):
+    with pytest.raises(
+        SystemExit, match=r"has checkpoints, which training again would replace: resume with --load-dir"
+    ):
         train.main(again)
 
 

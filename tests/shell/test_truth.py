@@ -98,7 +98,7 @@ def test_it_is_told_how_much_of_the_shell_has_a_truth_and_how_far_apart_they_are
     np.save(tmp_path / "matrix.npy", shifted)
     told = shellgs("cast", scene, "--truth", survey, "--matrix", tmp_path / "matrix.npy")
     assert float(told.split("the two are ")[1].split(" m apart")[0]) > 0.5
-    assert "Is it of this building" in told
+    assert "Check that it shows this building" in told
     assert Alignment.load(scene / ALIGNMENT) == alignment
 
 
@@ -151,7 +151,7 @@ def test_the_command_that_a_changed_truth_is_refused_with_casts_it_again_in_its_
         (["--truth", "no.ply"], "no.ply"),
         (["--truth"], "--truth names no file: give one or more, or leave it out"),
         (["--shell"], "--shell names no file"),
-        (["--truth", "{shell}"], "is the shell itself, and proves nothing"),
+        (["--truth", "{shell}"], "is the shell itself, which proves nothing"),
         (["--truth", "{shell}", "--shell", "{shell}", "--matrix", "m.npy"], "give --shell or --truth"),
         (["--truth", "{shell}", "--metres-per-shell-unit", "0.001"], "go with --matrix"),
     ],

@@ -356,25 +356,25 @@ def test_an_unknown_option_and_an_action_with_nan_or_of_another_shape_are_refuse
     with pytest.raises(SceneError, match="no option gaol"):
         env.reset(options={"gaol": (9, -6)})
     env.reset(seed=0)
-    with pytest.raises(SceneError, match=r"action \[nan +0\. +0\.\] cannot be"):
+    with pytest.raises(SceneError, match=r"action cannot be \[nan +0\. +0\.\]"):
         env.step(np.array([np.nan, 0, 0]))
     for action in ([0.5], 0.5, [0.5] * 4, [[0.5] * 3]):
-        with pytest.raises(SceneError, match="cannot be: give each actuator a number"):
+        with pytest.raises(SceneError, match=r"the action cannot be .*: give each actuator a number"):
             env.step(np.array(action))
 
 
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"render_mode": "human"}, "render_mode 'human' cannot be"),
-        ({"pedestrians": -1}, "pedestrians -1 cannot be"),
-        ({"pedestrians": 1.5}, "pedestrians 1.5 cannot be"),
-        ({"rgb": True}, "rgb True cannot be"),
-        ({"rgb": (160, 90)}, r"rgb \(160, 90\) cannot be"),
-        ({"rgb": CameraSettings(0, 0)}, r"rgb CameraSettings\(width=0, .* cannot be"),
-        ({"distance": 5}, "distance 5 cannot be"),
-        ({"distance": (15, 5)}, r"distance \(15, 5\) cannot be"),
-        ({"distance": (5, np.nan)}, r"distance \(5, nan\) cannot be"),
+        ({"render_mode": "human"}, "render_mode cannot be 'human'"),
+        ({"pedestrians": -1}, "pedestrians cannot be -1"),
+        ({"pedestrians": 1.5}, "pedestrians cannot be 1.5"),
+        ({"rgb": True}, "rgb cannot be True"),
+        ({"rgb": (160, 90)}, r"rgb cannot be \(160, 90\)"),
+        ({"rgb": CameraSettings(0, 0)}, r"rgb cannot be CameraSettings\(width=0, "),
+        ({"distance": 5}, "distance cannot be 5"),
+        ({"distance": (15, 5)}, r"distance cannot be \(15, 5\)"),
+        ({"distance": (5, np.nan)}, r"distance cannot be \(5, nan\)"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused(folder, settings, says):

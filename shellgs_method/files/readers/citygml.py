@@ -39,7 +39,7 @@ def read_citygml(path: Path) -> Geometry:
     root = _parsed(path)
     of_service = root.tag.endswith("}FeatureCollection") and any("/citygml/" in each.tag for each in root.iter())  # WFS
     if _name(root) != "CityModel" and not of_service:
-        raise SceneError(f"the shell {path} is XML, but no CityGML: export it as CityGML, CityJSON, IFC or a mesh")
+        raise SceneError(f"the shell {path} is XML, but not CityGML: export it as CityGML, CityJSON, IFC or a mesh")
     model = _Model(root, metres_of_degrees(path))
     return outside(list(model.objects()), path, model.missing)
 

@@ -33,7 +33,7 @@ _OTHERS = {
 
 def _other_json(document: Any) -> str:
     names = document if isinstance(document, dict) else {}
-    usual = "json, but no CityJSON: export it as CityJSON, CityGML, IFC or a mesh"
+    usual = "json, but not CityJSON: export it as CityJSON, CityGML, IFC or a mesh"
     return next((words for name, words in _OTHERS.items() if name in names), usual)
 
 

@@ -50,8 +50,8 @@ class Geometry:
 def splats(path: Path) -> SceneError:
     """The refusal of a file of Gaussian splats, most of which float in front of the surface or behind it."""
     return SceneError(
-        f"the shell {path} holds Gaussian splats, which are no surface: give a scan or a mesh of the building, or a "
-        "mesh made of the splats (`shellgs mesh`, if they were trained here)"
+        f"the shell {path} holds Gaussian splats, which are not a surface: give a scan or a mesh of the building, or "
+        "a mesh made of the splats (`shellgs mesh`, if they were trained here)"
     )
 
 
@@ -81,7 +81,7 @@ def left_out(path: Path, count: int, total: int, what: str) -> None:
 def say_left_out(path: Path, counts: Mapping[str, int]) -> None:
     """Tell what a reader of building models leaves out, by kind: it is not seen from outside, or not read."""
     if some := [f"{count} {kind}" for kind, count in sorted(counts.items()) if count]:
-        notice(f"{path}: left out what is no outside of a building: {', '.join(some)}.")
+        notice(f"{path}: left out what is not on the outside of a building: {', '.join(some)}.")
 
 
 def refuse_degrees(points: Float64[np.ndarray, "N 3"], path: Path) -> None:

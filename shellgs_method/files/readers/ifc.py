@@ -217,12 +217,14 @@ def _complete(path: Path, model: Any, products: list) -> None:
         shape.ContextOfItems = contexts.get(shape.RepresentationIdentifier) or next(iter(contexts.values()))
     if lost:
         notice(
-            f"{path}: {len(lost)} of its shapes have no context, against IFC: they are taken for what they say to be."
+            f"{path}: {len(lost)} of its shapes have no context, which IFC requires: they are read as what they "
+            "claim to be."
         )
     if nowhere := [each for each in products if each.ObjectPlacement is None]:
         notice(
-            f"{path}: {len(nowhere)} of {len(products)} parts have a shape but no placement, against IFC, such as "
-            f"{nowhere[0].is_a()} {nowhere[0].GlobalId}: they are put at the origin, and openings are cut there."
+            f"{path}: {len(nowhere)} of {len(products)} parts have a shape but no placement, which IFC requires, "
+            f"such as {nowhere[0].is_a()} {nowhere[0].GlobalId}: they are put at the origin, and openings are cut "
+            "there."
         )
     for each in model.by_type("IfcPropertySet"):  # of IFC 2x3, which guides want at the project or at the site
         if (name := _MAP_SETS.get(str(each.Name).lower())) and model.schema == "IFC2X3":
@@ -312,8 +314,8 @@ def _tell_of_phases(path: Path, products: list, ifcopenshell: ModuleType) -> Non
     if passing := {status: said[status] for status in _PASSING if said[status]}:
         counted = ", ".join(f"{count} {status}" for status, count in passing.items())
         notice(
-            f"{path}: some of its {len(products)} parts are marked {counted}, and are read as the others: where "
-            "photographs do not show them, export the model without them, or they hide the building."
+            f"{path}: some of its {len(products)} parts are marked {counted}, and are read like the others: if "
+            "photographs do not show them, export the model without them, since they would hide the building."
         )
 
 

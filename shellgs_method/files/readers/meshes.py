@@ -96,7 +96,9 @@ def _binary_stl(path: Path, data: bytes) -> Geometry:
     if end > len(data):
         raise ValueError(f"its header claims {claimed} triangles, but it has {len(data)} bytes")
     if data[end:].strip(b"\0 \r\n"):
-        raise ValueError(f"it goes on for {len(data) - end} bytes after the {claimed} triangles that its header claims")
+        raise ValueError(
+            f"it continues for {len(data) - end} bytes after the {claimed} triangles that its header claims"
+        )
     return _soup(np.frombuffer(data, _STL, claimed, _STL_START)["corners"].astype(np.float64))
 
 

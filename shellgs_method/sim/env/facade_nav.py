@@ -111,13 +111,13 @@ class FacadeNav(gymnasium.Env, EzPickle):
     ) -> None:
         EzPickle.__init__(self, world, robot, depth, rgb, pedestrians, obstacle, distance, everywhere, render_mode)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise SceneError(f"render_mode {render_mode!r} cannot be: give 'rgb_array'; its images can be shown")
+            raise SceneError(f"render_mode cannot be {render_mode!r}: give 'rgb_array'; its images can be shown")
         if not isinstance(pedestrians, Integral) or pedestrians < 0:
-            raise SceneError(f"pedestrians {pedestrians} cannot be: give the number of people who walk about, or 0")
+            raise SceneError(f"pedestrians cannot be {pedestrians}: give the number of people who walk about, or 0")
         if rgb and not (isinstance(rgb, CameraSettings) and min(rgb.width, rgb.height) > 0):
-            raise SceneError(f"rgb {rgb} cannot be: give CameraSettings(160, 90), its width and height, or None")
+            raise SceneError(f"rgb cannot be {rgb}: give CameraSettings(160, 90), its width and height, or None")
         if np.shape(distance) != (2,) or not 0 <= distance[0] < distance[1]:
-            raise SceneError(f"distance {distance} cannot be: give the smallest and the largest in metres, as (5, 15)")
+            raise SceneError(f"distance cannot be {distance}: give the smallest and the largest in metres, as (5, 15)")
         self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
         self.model = self.world.model
         self._steps = int(np.ceil(STEP / MOVES / self.model.opt.timestep - 1e-6))  # of MuJoCo between two moves
@@ -181,7 +181,7 @@ class FacadeNav(gymnasium.Env, EzPickle):
                 be taken for all.
         """
         if np.shape(action) != self.action_space.shape or np.isnan(action).any():
-            raise SceneError(f"the action {action} cannot be: give each actuator a number from -1 to 1")
+            raise SceneError(f"the action cannot be {action}: give each actuator a number from -1 to 1")
         low, high = self.model.actuator_ctrlrange.T
         self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
         was, collides = self.data.mocap_pos.copy(), False
