@@ -24,18 +24,19 @@ class CaptureConfig:
     """Maximum number of frames taken from a video; never more than five per second, and fewer where the picture moves
     little."""
     matching: Matching = "auto"
-    """Photographs to match: neighbours in the order of their names, then those that see the same by a first model
-    (sequential), or all pairs (exhaustive). If auto: sequential for a video and for more than 60 photographs."""
+    """Photographs to match: neighbours in the order of their names, then those that see the same according to a
+    first model (sequential), or all pairs (exhaustive). If auto: sequential for a video and for more than 60
+    photographs."""
     overlap: FromOne = 10
-    """Number of next photographs to match each with, and of others that see the same, if sequential. Reduce it if
+    """If sequential: number of following photographs to match each with, and of others that see the same. Reduce it if
     identical windows are confused."""
     cameras: Cameras = "auto"
-    """Photographs that share a camera: all (single), those of a folder, those of a folder whose camera is mounted with
-    those of the others, which took the photographs of the same name at once (rig), or none (image). If auto: those with
-    the same size, lens and zoom."""
+    """Photographs that share a camera: all (single), those of a folder (folder), those of a folder in a rig of cameras
+    that are mounted together and take photographs of the same name at the same time (rig), or none (image). If auto:
+    those with the same size, lens and zoom."""
     camera_type: CameraType = "auto"
     """Photographs are ordinary ones (perspective), or panoramas of 360° cameras (equirectangular), which are cut into
-    ordinary ones. If auto: panoramas are those that say so in their metadata, or else go around by their pixels."""
+    ordinary ones. If auto: panoramas are recognised by their metadata, or else by left and right edges that match."""
     quality: Literal["fast", "high"] = "fast"
     """Image size for features: 1600 pixels (fast), or 3200 and the doubled image (high), several times slower."""
     masks: Optional[Path] = None

@@ -45,7 +45,7 @@ def align(
     spacing: Optional[Length] = None,
     paths: Paths = PATHS,
 ) -> None:
-    """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
+    """Align the shell to the scene, validate the result, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
     verdict. Without --matrix, --picks, --positions and --same-frame, an alignment is proposed, near the photographs'
@@ -59,8 +59,9 @@ def align(
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
         refine: Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres.
-        bundle_adjust: Then adjust the cameras to the shell, which unbends them, if the alignment is not refused: into
-            colmap/adjusted, which is used from then on. Without it, or with --colmap-path, the cameras are as before.
+        bundle_adjust: Then adjust the cameras to the shell, to correct bending, if the alignment is not refused. They
+            are written to colmap/adjusted, which is used from then on; without this option, or with --colmap-path, the
+            original cameras are used.
         accept: Accept the earlier proposal.
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference

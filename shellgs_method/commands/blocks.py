@@ -34,15 +34,15 @@ def blocks(
     """Cut a large scene into blocks that are trained one by one, with `shellgs street`.
 
     Cuts are vertical, across the street, where buildings end. They are written to scene/blocks.json and drawn from
-    above in scene/blocks.png. A cut may be moved by hand: the same command keeps cuts and overlap of a blocks.json
-    that is there, and finds which photographs show each block.
+    above in scene/blocks.png. A cut may be moved by hand: the same command keeps the cuts and the overlap of an
+    existing blocks.json, and finds which photographs show each block.
 
     Args:
         scene: Scene folder with the shell's maps (`shellgs cast`), or else with SfM points that have tracks.
         length: Length of a block in metres.
         photographs: Number of photographs of a block, in place of its length.
         overlap: How far a block reaches beyond its cuts, in metres.
-        again: Cut anew.
+        again: Make new cuts.
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views

@@ -53,31 +53,33 @@ def cast(
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
     Then the photographs are compared with each other, on the shell and in front of it: where they agree on something
-    nearer, such as a tree or a railing, the shell does not count. What hides it in one photograph only, such as a
-    passer-by, is ignored in training. The result is in scene/cues/checked. Occluders that it misses can be painted
+    nearer, such as a tree or a railing, the shell is ignored. What hides it in one photograph only, such as a
+    passer-by, is ignored in training. The result is in scene/cues/checked. Missed occluders can be painted
     black in scene/shell/masks/<image path>.png. The same command resumes an interrupted cast.
 
-    With --truth, a scan that is held apart from the shell is cast in its stead, into scene/cues/truth: metrics are also
-    against it from then on. Cast the shell first.
+    With --truth, a second scan, the ground truth, is cast instead of the shell, into scene/cues/truth, and metrics are
+    also measured against it from then on. Cast the shell first.
 
     Args:
         scene: Scene folder.
         shell: Files of the shell, with --matrix: meshes, models or point clouds. If not set: those of
             scene/shell/alignment.json.
-        matrix: File of the 4x4 similarity from the shell's (or the truth's) frame to the scene's (text, json or npy).
+        matrix: File of the 4x4 similarity from the shell's (or ground truth's) frame to the scene's (text, json or
+            npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix. If not set: that of its coordinate
             reference system, else a metre.
-        crs: Coordinate reference system of the shell (or the truth), with --matrix. If not set: as for `shellgs align`.
-        truth: Files of the building to measure against, which were held apart: meshes, models or point clouds, in the
-            shell's frame and unit, or in their own with --matrix.
+        crs: Coordinate reference system of the shell (or ground truth), with --matrix. If not set: as for `shellgs
+            align`.
+        truth: Files of the ground truth to measure against: meshes, models or point clouds that are not part of the
+            shell, in the shell's frame and unit, or in their own with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size, or
             that of the shell's maps with --truth.
         mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
             (for round shapes). If not set: as the alignment was validated; another one leaves it without a verdict.
         spacing: Size in metres of the voxels in which the points of a cloud are merged. If not set: as the alignment
             was validated, or what the cameras resolve.
-        check: Compare the photographs to find what occludes the shell.
+        check: Compare the photographs to find occluders.
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import FacadeDataParserConfig, read_views

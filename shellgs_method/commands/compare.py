@@ -30,7 +30,8 @@ def compare(
 ) -> None:
     """Train and evaluate methods on scenes, and write the paper's tables and figures and an HTML report.
 
-    Finished runs are kept, interrupted ones resume, and a failed run stops no other. Changed settings are refused.
+    Finished runs are kept, interrupted ones resume, and a failed run does not stop the others. Changed settings are
+    refused.
 
     Args:
         scenes: Scene folders; the first is set beside the paper's primary scene, the others beside its second.

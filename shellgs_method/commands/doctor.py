@@ -10,7 +10,7 @@ from shellgs_method.commands.common import console, table
 
 
 def doctor() -> None:
-    """Check what this machine can run, and name the remedy for what it cannot."""
+    """Check what this machine can run, and name what to install for the rest."""
     from shellgs_method.machine.doctor import examine
 
     parts = table("", "part", "finding", title="shellgs doctor")

@@ -17,12 +17,12 @@ def merge(
     configs: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="CONFIG [CONFIG ...]")],
     output: Path = Path("merged"),
 ) -> None:
-    """Merge the runs of all blocks of a scene into one run, and report how it is along the cuts.
+    """Merge the runs of all blocks of a scene into one run, and report its quality along the cuts.
 
-    What it writes is a run like any other: ns-eval, ns-viewer and the commands of shellgs take its config.yml.
+    The result is a run like any other: ns-eval, ns-viewer and the commands of shellgs accept its config.yml.
 
     Args:
-        configs: The config.yml of a run of each block.
+        configs: The config.yml of one run of each block.
         output: Folder of the merged run.
     """
     tell("Reading the runs of the blocks")

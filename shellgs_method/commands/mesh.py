@@ -19,8 +19,8 @@ def mesh(
 ) -> None:
     """Write a triangle mesh of a trained run, in metres in the shell's frame, and print its errors.
 
-    They are against the shell and, if known, the truth. A json beside the mesh holds its frame: a georeferenced shell's
-    large offset is there, not in the coordinates.
+    The errors are against the shell and, if known, the ground truth. A json beside the mesh holds its frame: a
+    georeferenced shell's large offset is there, not in the coordinates.
 
     Args:
         config: The run's config.yml.

@@ -27,7 +27,7 @@ def pick(
 ) -> None:
     """Pick points in the scan and in photographs, side by side in the browser, for `shellgs align --picks`.
 
-    Each click is written to the file of picks. The same command takes it up again.
+    Each click is saved in the file of picks. Run the same command again to continue.
 
     Args:
         scene: Scene folder.

@@ -41,15 +41,15 @@ def run(
 ) -> None:
     """Everything from a video and a scan to a mesh: capture, align, cast, train, evaluate, mesh.
 
-    The settings are written to SCENE.run, beside the scene: `shellgs run` alone goes on where it was interrupted, and
-    repeats what changed settings change. It stops where the alignment is doubtful or proposed: look at the report that
-    it opens, then go on with --accept, or add --picks to SCENE.run. Results are in SCENE-results. A scene that has
-    cameras already is not captured: give its photographs, and --scene.
+    The settings are written to SCENE.run, beside the scene: `shellgs run` alone resumes, and repeats the steps whose
+    settings have changed. It stops if the alignment is doubtful or proposed: look at the report that it opens, then
+    continue with --accept, or add --picks to SCENE.run. Results are in SCENE-results. A scene that already has cameras
+    is not captured: give its photographs, and --scene.
 
     Args:
         recipe: Settings.
         scene: Scene folder.
-        accept: Go on with the alignment that the report shows.
+        accept: Continue with the alignment that the report shows.
     """
     scene = scene if scene.name not in ("", "..") else scene.resolve()
     recipe = settled(recipe, scene.with_name(f"{scene.name}.run"))

@@ -29,8 +29,8 @@ def splats(
         output: Output file: .ply, .glb (glTF with KHR_gaussian_splatting), .spz or .html. If not set: splats.ply
             beside the config.
         levels: Number of levels of detail: each, NAME-1, NAME-2 and so on, has half as many Gaussians as the one
-            before: near ones are merged.
-        megabytes: Largest size of the file, or of the first level; near Gaussians are merged until it fits.
+            before: nearby ones are merged.
+        megabytes: Largest size of the file, or of the first level; nearby Gaussians are merged until it fits.
     """
     from shellgs_method.export.frame import Y
     from shellgs_method.export.levels import Level, psnr_of

@@ -27,19 +27,19 @@ def street(
 ) -> None:
     """Train a scene that `shellgs blocks` has cut: a coarse run of everything, then each block, and merge them.
 
-    Each step is skipped if it is done, and goes on where it was stopped.
+    Steps that are done are skipped, and interrupted ones resume.
 
     Args:
         scene: Scene folder with a blocks.json.
         method: Method: one of ShellGS, an ablation (docs/methods.md), or NAME='METHOD FLAGS'.
-        iterations: Training iterations of a block on average; each has them by the number of its photographs.
+        iterations: Training iterations of an average block; those of each are proportional to its photographs.
         coarse_iterations: Training iterations of the coarse run.
         coarse_scale: Size of the coarse run's photographs, as a share of the blocks'.
         seed: Seed of all runs.
         output: Folder of all runs; the merged one is in merged/SCENE/METHOD/seed-SEED below it.
         launcher: Where to run: on this machine (local), on a Ray cluster (ray), or nowhere (script): the commands that
-            can be started now are printed, one line a run, for a queue of your own.
-        jobs: Number of runs at once, with the local launcher; each has a GPU of its own, if there are as many.
+            can be started now are printed, one line per run, for your own queue.
+        jobs: Number of runs at once, with the local launcher; each on its own GPU, if there are as many.
         cluster: The Ray cluster.
         paths: Paths of the scene's files.
     """

@@ -14,16 +14,16 @@ GB = 10**9
 
 @dataclass(frozen=True)
 class Cluster:
-    """A Ray cluster, and what each run takes of it; an autoscaling cluster starts the nodes that runs ask for."""
+    """A Ray cluster, and what each run takes of it; an autoscaling cluster starts the nodes that runs request."""
 
     address: Optional[str] = None
     """Address of a running Ray cluster, or auto. If not set: one is started on this machine."""
     gpus_per_run: Optional[Weight] = None
-    """GPUs that a run takes of a Ray cluster. If not set: 1 if a node has one now, else 0."""
+    """GPUs for each run on a Ray cluster. If not set: 1 if a node has one now, else 0."""
     cpus_per_run: Length = 1.0
-    """CPU cores that a run takes of a Ray cluster."""
+    """CPU cores for each run on a Ray cluster."""
     memory_per_run: Optional[Weight] = None
-    """Memory in GB that a run takes of a Ray cluster. If not set: memory is not looked at."""
+    """Memory in GB for each run on a Ray cluster. If not set: memory is not considered."""
 
     def __post_init__(self) -> None:
         """Refuse what Ray cannot give.
