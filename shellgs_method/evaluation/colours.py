@@ -20,7 +20,7 @@ CLASS_COLOURS = {
     SurfaceClass.ROOF: to_rgb("#cc6677"),
     SurfaceClass.GROUND: to_rgb("#117733"),
 }
-"""Colours of the classes of surfaces: Paul Tol's muted scheme, which the colour-blind tell apart."""
+"""Colours of the classes of surfaces: Paul Tol's muted scheme, distinguishable by the colour-blind."""
 MAX_ERROR = 45.0
 """Angle in degrees at which the error scale saturates."""
 

@@ -39,8 +39,8 @@ def image_errors(
     Colours are in [0, 1]; a render's may be larger, and are clipped once they are corrected. SSIM is as in the loss,
     with a Gaussian window of 11 pixels and sigma 1.5; LPIPS uses the AlexNet backbone. PSNR and SSIM of each region
     that is not empty are ``psnr_…`` and ``ssim_…`` with its name. The same metrics of the :func:`colour_corrected`
-    render are ``cc_psnr`` and so on; it is corrected over the region ``seen`` if there is one: what training views do
-    not show says nothing of a photograph's exposure.
+    render are ``cc_psnr`` and so on; it is corrected over the region ``seen`` if there is one: pixels that no training
+    view shows say nothing about a photograph's exposure.
 
     Pixels outside ``kept`` are ignored: they are set to the target, so that no window differs there, and excluded from
     all means. LPIPS, whose mean is over all pixels, is divided by the share of kept pixels.
@@ -59,9 +59,9 @@ def colour_corrected(
 ) -> Float[Tensor, "H W 3"]:
     """The affine map of a render's colours that is closest to its photograph in least squares, clamped to [0, 1].
 
-    It takes out what exposure, white balance and a camera's colours change: nothing else does these justice where a
-    held-out photograph has an exposure of its own. Nerfstudio's metrics of this name fit a quadratic map, five times in
-    a row, which takes out more; gsplat has both.
+    This removes differences of exposure, white balance and camera colours, which a method cannot know for a held-out
+    photograph. Nerfstudio's metrics of this name fit a quadratic map, five times in a row, which removes more; gsplat
+    has both.
 
     Args:
         rgb: render, in [0, 1] or not clipped.

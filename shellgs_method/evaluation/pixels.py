@@ -13,10 +13,10 @@ from torch.nn.functional import max_pool2d
 from shellgs_method.geometry.reference import Reference
 
 MARGIN = 2
-"""Pixels around what stands in front of the shell that its splats also cover."""
+"""Margin in pixels around occluders, which their splats also cover."""
 DOUBTED = 0.2
-"""Weight of the shell where photographs doubt it: enough on plain walls, where nothing else pulls, and too little where
-they show something else."""
+"""Weight of the shell where it is doubtful: enough on plain walls, where no other term acts, and too little where
+photographs show an occluder."""
 
 
 def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
@@ -29,7 +29,7 @@ def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W
 def photometric_pixels(
     batch: dict, image: Float[Tensor, "H W 3"], ignore_transients: bool
 ) -> Bool[Tensor, "H W 1"] | None:
-    """Pixels of a photograph to train on, None for all: :func:`kept_pixels`, without what is known to have moved."""
+    """Pixels of a photograph to train on, None for all: :func:`kept_pixels`, without detected moving objects."""
     if ignore_transients and "transient" in batch and batch["transient"].any():
         return kept_pixels(batch, image) & ~_with_margin(batch["transient"].to(image.device))
     return kept_pixels(batch, image) if "mask" in batch else None

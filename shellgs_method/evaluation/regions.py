@@ -1,4 +1,4 @@
-"""Regions of a held-out view, and its metrics over them; which pixels count at all is said in ``pixels``."""
+"""Regions of a held-out view, and its metrics over them; ``pixels`` says which pixels count at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def reference_errors(
 ) -> dict[str, float]:
     """Metrics of :func:`geometry_errors` against each reference in a batch: the shell, and ``truth_…``.
 
-    Where metres are known, also ``truth_f_score_5cm_…`` over two of the :func:`regions`: on and before the shell.
+    Where metres are known, also ``truth_f_score_5cm_…`` over two of the :func:`regions`: on and in front of the shell.
     """
     metrics, found = {}, references(batch, rendering.depth.device)
     for prefix, reference in found.items():
@@ -46,8 +46,9 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
 
     * ``seen``: all of it.
     * ``on_shell``, ``off_shell``: on the shell, or where it is absent, does not count or is larger than the building.
-    * ``before_shell``: where the truth is nearer than the shell by more than 5 cm (1/200 of its depth where metres are
-      unknown) or, where there is no truth, photographs show something nearer. These pixels are in neither of the above.
+    * ``before_shell``: where the ground truth is nearer than the shell by more than 5 cm (1/200 of its depth where
+      metres are unknown) or, without ground truth, photographs show an occluder. These pixels are in neither of the
+      above.
     """
     if "seen" not in batch:
         return {}

@@ -225,5 +225,5 @@ def _deviation(values: float | Sequence[float]) -> float | None:
 
 
 def against_truth(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Those of metrics that are against the true geometry, by the names of those against the shell."""
+    """The metrics against the ground truth, by the names of those against the shell."""
     return {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}

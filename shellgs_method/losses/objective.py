@@ -39,7 +39,7 @@ MAX_KEPT_SHARE = 0.1
 KEPT_BYTES = 120
 """Bytes that the losses of a pixel take, of all terms: 118 of `shellgs-metric`."""
 SOLID = 0.5
-"""Opacity that the shell must have where what is behind it may be seen through it."""
+"""Opacity that the shell must have where it may be seen through."""
 DISTORTION_FROM = 3000
 """First iteration of the distortion, as in 2DGS."""
 
@@ -66,7 +66,7 @@ class ExtraLossConfig:
 
     normal_consistency: Weight = 0.0
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05).
-    Only of pixels without a cue, so that walls continue beyond the shell, but not what photographs show before it."""
+    Only of pixels without a cue, so that walls continue beyond the shell, but not on occluders."""
     normal_consistency_from: Count = 7000
     """First iteration of that term, of a run of 30 000: it scales with the length of the run."""
     distortion: Weight = 0.0
@@ -99,15 +99,15 @@ class Objective:
 
     Args:
         cues: maps that supervise the geometry.
-        trust: what counts where photographs contradict the shell.
+        trust: which of the two is trusted where photographs contradict the shell.
         paper: terms against the cues.
         extra: terms beyond the paper.
         metres_per_unit: metres per unit of the world; None if unknown.
         shell_error: error of the shell's alignment in metres; None if unknown.
 
     Attributes:
-        light: what photographs and renders are multiplied by in R: more than 1 where there is little light, so that it
-            weighs as much against the other terms, and densifies as much, as by day.
+        light: factor of photographs and renders in R: above 1 for dark photographs, so that R has as much weight
+            against the other terms, and densifies as much, as by day.
     """
 
     def __init__(

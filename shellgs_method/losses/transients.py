@@ -22,9 +22,9 @@ HIDDEN = 1.1
 class Transients(nn.Module):
     """Colours and rendered depths of V photographs, by which one is compared with others at the rendered surface.
 
-    RobustNeRF (Sabour et al. 2023) leaves out a photograph's largest residuals, smoothed over its pixels, and with
-    them what is not learned yet. Here the render of a view is compared with the other photographs as well: they confirm
-    it where it is right and only this photograph shows something else. Where it is wrong, they differ from it as much.
+    RobustNeRF (Sabour et al. 2023) leaves out a photograph's largest residuals, smoothed over its pixels, and with them
+    what is not learned yet. Here the render of a view is compared with the other photographs as well: where only this
+    photograph shows something else, they agree with the render; where the render is wrong, they differ from it as much.
     Nothing is left out where fewer than two others see the surface.
     """
 

@@ -1,4 +1,4 @@
-"""What photographs say against the shell."""
+"""Where photographs contradict the shell."""
 
 from shellgs_method.occlusion.check import check_views, compared_others
 from shellgs_method.occlusion.displaced import DISPLACED, Displaced

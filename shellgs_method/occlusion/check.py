@@ -50,13 +50,14 @@ from shellgs_method.occlusion.low_light import LowLight
 from shellgs_method.occlusion.neighbours import FARTHEST, sides
 
 MAX_SIZE = 640
-"""Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
+"""Longer side in pixels at which photographs are compared, also if the maps are smaller, so that thin objects are
+visible."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 COMPARED = "photographs"
 """Name of the digest of what was compared, in the maps' manifest."""
 NEARBY = 0.005
-"""Share of a view's SfM points on the shell that are so near only if something is: of wrong ones a thousandth is."""
+"""Share of a view's SfM points on the shell above which something is that near: of outliers, a thousandth is."""
 VERSION = 19
 """Version of the maps: maps of another version are made again."""
 
@@ -89,13 +90,13 @@ def check_views(
     plain or reflecting walls, and where few views overlap.
 
     Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
-    training views contain nothing of the held-out ones. With photographs whose cameras are wrong, nothing is compared.
+    training views contain nothing of the held-out ones. Photographs with wrong cameras are not compared with others.
 
     Args:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
         held_out: names of the held-out views.
-        points: the SfM points, if any: where they are near a camera, something that near is looked for.
+        points: the SfM points, if any: where they are near a camera, occluders are searched as near.
 
     Raises:
         FileNotFoundError: the scene has no shell maps.

@@ -1,4 +1,4 @@
-"""Tell what stands in front of the shell by its colours, learnt from where the photographs are clear."""
+"""Detect occluders by their colours, learnt from pixels where the sweeps are certain."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST = 3.0  # absolute log-ratio
 class ColourModel:
     """How much likelier each colour is in front of the shell than on it, from histograms over all views of a scene.
 
-    The colour models of GrabCut (Rother et al. 2004) with, for the user's strokes, sweeps that are clear.
+    The colour models of GrabCut (Rother et al. 2004), with certain sweeps in place of the user's strokes.
     """
 
     def __init__(self, views: Iterable[ShellView], sweeps: Iterable[Sweep]) -> None:

@@ -38,11 +38,11 @@ from shellgs_method.occlusion.neighbours import (
 
 CONTRADICTED = 0.14
 """Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
-what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
-are less accurate."""
+occluders improve, but reflections contradict the shell too, and surfaces left to the photographs alone are less
+accurate."""
 DOUBTFUL = 0.01
-"""Score above which a pixel that is not contradicted is doubtful. Of what stands before the shell and is not found,
-a quarter to two thirds is, and a tenth of what is not."""
+"""Score above which a pixel that is not contradicted is doubtful. A quarter to two thirds of missed occluders are
+doubtful, and a tenth of the rest."""
 ALONE = 0.12
 """Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03
@@ -137,8 +137,8 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
     """Find the best depth behind the shell, of what a window reflects or lets through.
 
     The photographs must agree better there than on any surface that the shell may have at a pixel if it is off by its
-    error: at its edges, that is the nearest or the farthest surface around the pixel. Neighbours in which something
-    stands before the shell do not count; nor do plain parts of the photograph, which agree with others at any depth.
+    error: at its edges, that is the nearest or the farthest surface around the pixel. Neighbours in which an occluder
+    hides the shell do not count; nor do plain parts of the photograph, which agree with others at any depth.
 
     Args:
         view: the view.

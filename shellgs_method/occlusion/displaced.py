@@ -1,8 +1,7 @@
-"""Find photographs that show the building elsewhere than their cameras do.
+"""Find photographs with wrong cameras: they show the building at another place than their cameras say.
 
-One camera may be wrong where all others are right: structure from motion mistakes one bay of a facade for another, or
-photographs and poses are not in the same order. Such a photograph spoils the images of all that it shows, so it is not
-trained on.
+One camera may be wrong while all others are right: structure from motion confuses two bays of a facade, or photographs
+and poses are not in the same order. Training on such a photograph spoils the images of all that it shows.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ from shellgs_method.occlusion.exposure import Exposed, points_on_surface, sighti
 DISPLACED = "cues/checked/displaced.json"
 """File in the scene's folder that has the displaced photographs."""
 GAIN = 0.12
-"""Share of its correlation that a displaced photograph gains where it fits best: in fifteen scenes 84 % of those of
-other poses do, 86 and 92 % of those turned by 1 and 2 degrees, and none of 676 right ones. Most right ones gain 0.02,
-up to 0.113 where the shell is 30 cm too far forward."""
+"""Relative gain of correlation at the best displacement from which a photograph is displaced: in fifteen scenes 84 % of
+those with another's pose, 86 and 92 % of those rotated by 1 and 2 degrees, and none of 676 correct ones. Most correct
+ones gain 0.02, up to 0.113 where the shell is 30 cm too far forward."""
 FEW = 0.1
 """Share of the photographs, or two, that are displaced by cameras of their own, and not by the shell's place."""
 LEAST = 0.008
-"""Share of the longer side that counts as a displacement: right photographs reach a pixel of 320."""
+"""Share of the longer side that counts as a displacement: correct photographs reach one pixel of 320."""
 _REACH = 0.15  # of the longer side: largest displacement that is tried
 _OTHERS = 2  # photographs that must tell a point's colour, besides the one that is judged
 _SOME = 0.25  # correlation below which a gain is not relative any more: that of chance
@@ -53,7 +52,7 @@ def displacements(views: Sequence[Exposed], training: Bool[np.ndarray, " V"]) ->
 
     Args:
         views: the views, at a mean exposure.
-        training: whether each is a training view: held-out ones tell nothing of others.
+        training: whether each is a training view: others are not compared with held-out ones.
 
     Returns:
         Displacements in shares of the longer side.
@@ -96,7 +95,7 @@ class Displaced:
 
     @classmethod
     def read(cls, scene: Path) -> Displaced:
-        """Those of a scene; none if it was not looked for them.
+        """Those of a scene; none if it was not searched for them.
 
         Raises:
             SceneError: the file is damaged.

@@ -1,4 +1,4 @@
-"""Exposure and white balance of photographs: what they do to colours, and what photographs of the same points say.
+"""Exposure and white balance of photographs: their effect on colours, and their estimation from common points.
 
 A gain in linear light acts on colours as they are stored, by sRGB's curve, as a scale about :data:`BLACK`, exactly so
 but for the darkest. Fitted to photographs at ±0.7 stops this leaves 55 dB, with a camera's gamma of 2.2 46 dB, with an
@@ -24,7 +24,7 @@ from shellgs_method.geometry.camera import Camera
 BLACK = -OFFSET
 """Colour about which a gain is a scale."""
 UNCLIPPED = (0.04, 0.97)
-"""Colours that say what a gain is: darker ones are in the curve's toe, brighter ones may be clipped."""
+"""Colours that determine a gain: darker ones are in the curve's toe, brighter ones may be clipped."""
 MAX_PROJECTIONS = 400_000
 """Most projections of points of the shell into views, all views together."""
 MAX_SIZE = 320
@@ -32,7 +32,7 @@ MAX_SIZE = 320
 VISIBLE = 0.02
 """Relative depth by which a point may lie behind what a view shows without being hidden."""
 MOST_KNOWN = 2.0
-"""Greatest logarithm of a gain, against the median, that is believed without sightings: 2.9 stops."""
+"""Largest logarithm of a gain, relative to the median, that is accepted without sightings: 2.9 stops."""
 _STEPS, _SMALLEST = 20, 0.02  # of the iterative reweighting; residual below which a sighting weighs no more
 _PRIOR = 1.0  # weight of what is known of a photograph without points: that of a sighting with a residual of 1
 
@@ -156,12 +156,12 @@ def log_gains(sightings: Sightings, known: Float64[ndarray, " V"]) -> Float64[nd
 
 
 class SurfaceColours(NamedTuple):
-    """Points of a surface, whose colours tell the gain of a further photograph without those of all others again."""
+    """Points of a surface, whose colours determine the gain of a further photograph without all others again."""
 
     points: Float[Tensor, "N 3"]
     """In the cameras' world."""
     logs: Float64[ndarray, "N 3"]
-    """Logarithms of their colours in linear light, at gains of 1; NaN where no photograph tells."""
+    """Logarithms of their colours in linear light, at gains of 1; NaN where no photograph shows them."""
 
     @classmethod
     def of(cls, sightings: Sightings, gains: Float64[ndarray, "V 3"], points: Float[Tensor, "N 3"]) -> SurfaceColours:

@@ -1,8 +1,7 @@
-"""Make photographs of little light comparable: their costs in a sweep are differences of colours, which shrink with it.
+"""Make dark photographs comparable: the costs of a sweep are differences of colours, which shrink with the light.
 
-A facade by day is left as it is. Where its photographs have a fifth of their brightness, 59 instead of 28 % of what
-stands in front of the shell is found, by day 68 %; in the noise of a night 26 instead of 11 %, and 7 instead of 58 % of
-the rest are doubted.
+A facade by day is left as it is. With photographs at a fifth of their brightness, 59 instead of 28 % of the occluders
+are found (by day 68 %); in the noise of a night 26 instead of 11 %, and 7 instead of 58 % of the rest are doubtful.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from shellgs_method.occlusion.contradiction import ShellView
 from shellgs_method.occlusion.exposure import BLACK, exposed_image
 
 NOISY = 9
-"""Standard deviation of the noise of their mean colour, of 255, above which they are blurred: by less, thin things are
-lost."""
+"""Standard deviation of the noise of their mean colour, of 255, above which they are blurred; with less noise, a blur
+loses thin objects."""
 BLUR = 0.8
 """Standard deviation of the blur in pixels."""
 _LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # the difference of two

@@ -20,8 +20,8 @@ MOVES = 5.5
 """Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and with much more
 fewer photographs show the same."""
 MOVES_ON = 4.0
-"""Most pixels by which a place moves in the nearest photograph from one tried depth to the next. Where photographs are
-far apart, thin things were between two."""
+"""Largest motion of a point in the nearest photograph, in pixels, from one tried depth to the next, so that thin
+objects are not missed between two."""
 _SAME, _AHEAD = 3.0, 0.94
 """Parallax of the shell in pixels, and cosine of the angle, within which cameras show the same: less than the cameras
 of a walk are apart, and the directions of a panorama."""

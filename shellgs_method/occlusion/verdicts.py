@@ -23,14 +23,14 @@ from shellgs_method.geometry.voxels import cell_means, voxel_cells
 CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
 """File in the scene's folder for :meth:`Verdicts.write`, shown by viewers."""
 MANY = 6
-"""Photographs that must contradict a point, and be half of those that see it, for the building to differ from its
-shell there. An occluder farther in front of the shell hides different points in each photograph, and a pane
-mirrors others."""
+"""Number of photographs, and at least half of those that see a point, that must contradict it for the building to
+differ from its shell there. An occluder farther in front of the shell hides different points in each photograph, and a
+pane mirrors others."""
 MOVED = 0.004
 """Share of a view's shell above which what moved is worth mentioning."""
 UNCLEAR = 0.25
-"""Share of the shell's pixels that is doubted from which photographs tell too little: a tenth at most by day, half and
-more in the noise of the night."""
+"""Doubtful share of the shell's pixels above which the user is warned: at most a tenth by day, half and more in the
+noise of a night."""
 _STEP = 4  # stride in pixels of the lifted points
 _ACROSS = 300  # points along the longest side of the shell
 _SAME = 0.01  # relative difference of depth within which a point is visible in a view's shell map
@@ -73,7 +73,7 @@ class Verdicts:
         distance: median distance of what stands in front of each; NaN where no view shows it.
         views: names of all views.
         moved: share of each view's shell that is hidden by something that moved, since no other view shows it.
-        doubted: share of each view's shell that something may stand in front of.
+        doubted: share of each view's shell that is doubtful.
     """
 
     places: Float64[np.ndarray, "N 3"]
@@ -92,7 +92,7 @@ class Verdicts:
 
     @property
     def unclear(self) -> float:
-        """Share of a view's shell that is doubted, in the mean."""
+        """Mean doubtful share of a view's shell."""
         return float(self.doubted.mean()) if len(self.doubted) else 0.0
 
     def write(self, path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Unbend the cameras of a scene by its shell: bundle adjustment with the SfM points that lie on the shell.
+"""Correct bent cameras of a scene by its shell: bundle adjustment with the SfM points that lie on the shell.
 
-A similarity cannot absorb the drift of structure from motion: cameras bend at hardly any reprojection error, by wrong
-observations and a wrong distortion. The shell's walls are where they are.
+A similarity cannot absorb the drift of structure from motion: cameras bend, with hardly any reprojection error, because
+of outliers and wrong distortion. The shell's walls are fixed.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ HELD_OUT = 0.1
 ENOUGH = 200
 """Tracks that are left out, if these are not more than three in ten."""
 FEW = 50
-"""Points on the shell that determine nothing, and tell nothing of cameras."""
+"""Number of points on the shell below which the cameras cannot be adjusted or checked."""
 SIGNIFICANT = 2.0
-"""Standard errors by which held-out points must be likelier with adjusted cameras. True ones of two scenes reach
-none of these, and the film of the tutorial 3.2."""
+"""Standard errors by which held-out points must be likelier with adjusted cameras. True cameras of two scenes do not
+reach it, those of the tutorial's film 3.2."""
 _FINEST = 0.005
-"""Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
+"""Smallest noise of a shell in metres: no scan of a building is better, and no building equals its model."""
 _PATCH = 1.0
-"""Metres: how far the errors of a shell are alike, so that all points in a patch of this size count as one."""
+"""Size in metres of the patches in which a shell's errors are correlated, so that the points of each count as one."""
 _PICKED = 0.005
-"""Metres: standard deviation of a pick on the shell. Picks are worse than that, and yet tell more: what points on the
-shell say together has a bias, since many are of frames and sills a centimetre or two off it."""
+"""Metres: standard deviation of a pick on the shell. Picks are less accurate than that, but SfM points have a common
+bias, since many are on frames and sills a centimetre or two off the shell."""
 _OUTLYING = 4.0
-"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are: of edges
-that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
+"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are, at edges
+that slide along others and at repeated windows; without a robust loss, they bend structure from motion."""
 _VIEWS = 3  # observations that are not wrong, which a track needs: nothing checks two
 _ROBUST, _GATES, _ROUNDS, _STEPS, _SHIFTS = 4, 7, 24, 3, 10
 _LOOSE = 0.3  # metres: a prior that keeps what nothing determines, such as where cameras are along a bare wall
@@ -67,7 +67,7 @@ _EXPECTATIONS = 50
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What the tracks that were left out of the adjustment say of it; their points are triangulated.
+    """The adjustment judged by held-out tracks, whose points are triangulated.
 
     Attributes:
         points: how many are near the shell.
@@ -129,7 +129,7 @@ class Adjustment:
         deviations: standard deviation of its centre.
         pixel: noise of a keypoint's coordinate, in pixels.
         noise: noise of the shell, in metres.
-        held_out: what the tracks that were left out say.
+        held_out: the judgement by held-out tracks.
     """
 
     model: Model
@@ -158,8 +158,8 @@ def adjusted(
     of the shell are drawn onto the planes of their closest triangles, each by the probability that it lies on it
     (:class:`Mixture`). The gate shrinks from :data:`REACH` to :data:`GATE`.
 
-    The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
-    wrong has left a rest in them, which bends cameras.
+    The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a wrongly estimated distortion
+    leaves a residual in them, which bends cameras.
 
     Args:
         surface: the shell.
@@ -360,7 +360,7 @@ class Mixture:
 
     Others are of frames, sills and railings. Each side of the building has its own share of the shell's points, since
     before reveals there are hardly any but those of frames, and its own noise: points of edges seen against the sky or
-    at grazing angles scatter more than their tracks tell.
+    at grazing angles scatter more than their tracks imply.
 
     Attributes:
         probability: of each point to be of the shell.

@@ -89,7 +89,7 @@ def system_and_unit(shell: Sequence[Path], crs: str | None, metres: float, scene
 
 
 def in_its_system(alignment: Alignment, mesh: ShellMesh) -> Alignment:
-    """The alignment, which is said to be in its system only if the shell is in the area of that."""
+    """The alignment; its system is recorded only if the shell is in the area of that."""
     return replace(alignment, crs=crs_there(alignment.crs, mesh.centre, alignment.metres_per_shell_unit))
 
 
@@ -112,7 +112,7 @@ class Placement:
         history: one sentence per step, for the report.
         correspondences: picks or camera positions with their residuals, if any.
         proposed: whether it comes from coarse registration and the user has not accepted it yet.
-        checks: how sure it is that the shell is nowhere else, for the validation.
+        checks: how certain it is that the shell fits nowhere else, for the validation.
     """
 
     alignment: Alignment
@@ -336,7 +336,7 @@ def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], poin
 def refined(
     placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, reach: float
 ) -> Placement:
-    """Refine a placement, which is off by ``reach`` metres at most, against the SfM points.
+    """Refine a placement, which is off by at most ``reach`` metres, against the SfM points.
 
     Raises:
         SceneError: the coordinates of the points or the shell are too coarse to follow, or too few points are within

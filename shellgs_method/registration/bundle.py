@@ -1,7 +1,7 @@
 """Bundle adjustment: cameras, lenses and points by sparse Levenberg-Marquardt, points eliminated (Schur complement).
 
 Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000. Besides reprojection errors there are the distances of
-points from planes and of camera centres from given positions, which COLMAP's bundle adjustment has not.
+points from planes and of camera centres from given positions, which COLMAP's bundle adjustment does not have.
 """
 
 from __future__ import annotations

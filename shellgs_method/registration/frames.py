@@ -1,4 +1,4 @@
-"""Refuse picks and camera positions that are not in the shell's frame, rather than to place the shell by them."""
+"""Refuse picks and camera positions that are not in the shell's frame, instead of placing the shell by them."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import transformed
 
 REACH = 10.0
-"""Median distance in metres of cameras from their geo-tags, beyond which an alignment is another: between houses,
-signals are reflected."""
+"""Median distance in metres of cameras from their geo-tags, beyond which an alignment is a wrong one; between
+buildings, signals are reflected."""
 _LEAST = 3
 _SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 

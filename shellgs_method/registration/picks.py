@@ -81,8 +81,8 @@ class PickedPoint(Correspondence):
 def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
     """Read a file of picks, in the coordinate reference system that its header names, or else the shell's, ``crs``.
 
-    Lines of photographs that are not in the scene are left out, as of a list that is of several flights, and with them
-    points of which too little is left; both are told.
+    Lines of photographs that are not in the scene are left out, as in a list of several flights, and with them points
+    of which too little is left; the user is told of both.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -105,8 +105,8 @@ def refine(
         rounding: largest error of the points and the shell by the rounding of their coordinates, in metres.
         last: the last limit, in metres.
         steps: most steps.
-        relative: measure distances relative to the scale, for a start whose scale is far off: in metres they are all
-            the less, the more the points shrink.
+        relative: measure distances relative to the scale, for a start whose scale is far off: in metres they would
+            shrink with the points.
 
     Raises:
         SceneError: fewer than 7 points are within reach of the shell.

@@ -57,7 +57,7 @@ def render_around(
         render: renders a pinhole camera; ``depth`` is its forward z, ``normal`` the colours of normals in its frame.
 
     Returns:
-        The same outputs, but ``depth`` is the distance from the camera, which may see more than what is before it.
+        The same outputs, but ``depth`` is the distance from the camera, which may also see what is behind it.
     """
     pose = camera.camera_to_worlds[0]
     directions = camera.generate_rays(camera_indices=0, keep_shape=True).directions @ pose[:, :3]

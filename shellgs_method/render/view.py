@@ -29,7 +29,7 @@ Gaussians = Mapping[str, Tensor]
 
 
 PAST = 0.1
-"""Share of a pixel's opacity below which what is not behind the shell is no surface, but haze before something else."""
+"""Share of a pixel's opacity below which what is not behind the shell is not a surface, but haze."""
 
 
 class Rendered(NamedTuple):

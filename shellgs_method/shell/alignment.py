@@ -43,7 +43,8 @@ class Alignment:
         cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
-        up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
+        up: the shell's direction upwards, a unit vector; if None, it is found from the cameras, where they determine
+        it.
         crs: coordinate reference system of the shell, a code such as EPSG:25832 or WKT; empty if unknown.
         hashes: sha256 of the shell's files that it was found for; none in files of older versions.
 
@@ -115,7 +116,7 @@ class Alignment:
         return None if up is None else _direction(self.rotation.T @ up)
 
     def bound(self, scene: Path, views: Sequence[View]) -> Alignment:
-        """The alignment bound to the shell's files as they are and to the cameras of views, which tell what is up.
+        """The alignment bound to the shell's present files and to the cameras of views, which determine what is up.
 
         Raises:
             FileNotFoundError: a file is missing.

@@ -31,7 +31,7 @@ from shellgs_method.shell.raycast import ShellCaster
 ALIGNMENTS = {"shell": ALIGNMENT, "truth": TRUTH}
 """Files of the alignments of what is cast, in the scene's folder, by the kinds of the maps."""
 NEARER = 0.988
-"""Depth of an occluder as a share of that behind it, at most: what the photographs' comparison tells apart."""
+"""Largest depth of an occluder, as a share of that behind it, which comparing photographs can distinguish."""
 _SOME = 40  # views that are searched for holes
 _HOLE, _BEYOND = 5, 1.1  # a hole is less than 5 pixels wide, and what it shows a tenth farther than what is around it
 MASKS = Path("shell/masks")
@@ -103,7 +103,7 @@ class PlacedShell:
 def cast_views(
     shell: PlacedShell, *, kind: Literal["shell", "truth"] = "shell", max_image_size: int | None = None, flags: str = ""
 ) -> CastSummary:
-    """Cast a shell, or a scan held apart as the truth, into its views and store the maps in ``cues`` of its scene.
+    """Cast a shell, or a ground truth, into its views and store the maps in ``cues`` of its scene.
 
     The maps are bound to :data:`ALIGNMENTS` of the scene, which must hold the shell's alignment, as
     :meth:`Alignment.record` writes it. Views with an intact map for the same camera, shell and alignment are skipped,
@@ -111,8 +111,8 @@ def cast_views(
 
     The shell lacks trees, cars and whatever else stands in front of it: :mod:`shellgs_method.occlusion` finds such
     occluders, and black pixels of ``shell/masks/<image's name>.png`` of the scene, if that file exists, are removed
-    from the view's mask, as are those of the photograph's own mask. From the truth's, also what they found to stand in
-    front of it, if the photographs were compared on the shell.
+    from the view's mask, as are those of the photograph's own mask. Detected occluders are removed from the ground
+    truth's mask too, if the photographs were compared on the shell.
 
     Args:
         shell: the shell in its place.
@@ -187,7 +187,7 @@ def seen_through(scene: Path, views: Sequence[View]) -> float:
 
 
 def truth_coverage(scene: Path, views: Sequence[View]) -> tuple[float, float]:
-    """Share of the shell's pixels that have a truth, and the median distance between the two there, in scene units.
+    """Share of the shell's pixels that the ground truth covers, and their median distance there, in scene units.
 
     Raises:
         FileNotFoundError: one of the two was not cast.

@@ -66,7 +66,7 @@ class ShellMesh:
 
     @property
     def centre(self) -> Float64[np.ndarray, " 3"]:
-        """Median vertex. What is in float32 is relative to it, so that no vertex far away costs the others theirs."""
+        """Median vertex; float32 values are relative to it, so that a distant vertex does not cost precision."""
         return np.median(self.vertices, axis=0)
 
     def above(self, normal: Float64[np.ndarray, " 3"], offset: float) -> ShellMesh:
@@ -95,7 +95,7 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
     """Mask of the triangles that have no area in single precision, in which rays are cast and distances measured.
 
     Their normals are not defined, and their points nearest to another are NaN. Their heights are within the rounding of
-    their own corners, relative to the median vertex: a vertex far away makes no other triangle flat.
+    their own corners, relative to the median vertex, so that a distant vertex does not make other triangles flat.
     """
     placed = (vertices - np.median(vertices, axis=0)).astype(np.float32)
     step = np.spacing(np.abs(placed[faces]).max(axis=(1, 2))).astype(np.float64)
@@ -106,7 +106,7 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
 
 
 def joined(meshes: Sequence[ShellMesh], paths: Sequence[Path], metres_per_unit: float = 1.0) -> ShellMesh:
-    """Join the meshes of a shell's files, which are in one frame; what makes that unlikely is said.
+    """Join the meshes of a shell's files, which are in one frame; the user is warned if that is unlikely.
 
     Args:
         meshes: mesh of each file.
