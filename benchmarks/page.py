@@ -25,7 +25,7 @@ COLUMNS = {
         Column("ssim_seen", "SSIM, seen", max),
         Column("psnr_on_shell", "on the shell", max, ".2f"),
         Column("psnr_off_shell", "off it", max, ".2f"),
-        Column("psnr_before_shell", "before it", max, ".2f"),
+        Column("psnr_before_shell", "in front of it", max, ".2f"),
         Column("cc_psnr_seen", "Corrected, seen", max, ".2f"),
     ),
     "surface": (
@@ -34,10 +34,10 @@ COLUMNS = {
         Column("depth_mae_m", "D-MAE (m)", min),
         Column("chamfer_m", "CD (m)", min),
         Column("f_score_5cm", "F5", max),
-        Column("truth_chamfer_m", "CD, truth", min),
-        Column("truth_f_score_5cm", "F5, truth", max),
+        Column("truth_chamfer_m", "CD, ground truth", min),
+        Column("truth_f_score_5cm", "F5, ground truth", max),
         Column("truth_f_score_5cm_on_shell", "on the shell", max),
-        Column("truth_f_score_5cm_before_shell", "before it", max),
+        Column("truth_f_score_5cm_before_shell", "in front of it", max),
     ),
 }
 """Columns of the two tables of a setting."""
