@@ -70,7 +70,7 @@ def open_page(path: Path) -> None:
 
 def place(frame: Frame) -> str:
     """The frame and unit of a result, in words."""
-    shift = f" less {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
+    shift = f" minus {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
     if not frame.metric:
         return f"The scene has no aligned shell: this is the scene's own frame{shift}, in units of unknown size."
     system = f", {frame.crs}" if frame.crs and len(frame.crs) < 20 else ""  # not a whole WKT

@@ -67,7 +67,7 @@ def demo(
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     panel = scene / "cues" / "shell" / "panel.png"
-    console.print(f"To look at meanwhile: {panel}, the shell in the photographs.", soft_wrap=True)
+    console.print(f"Meanwhile, look at {panel}, the shell in the photographs.", soft_wrap=True)
     runs = grid([scene], METHODS, [0], iterations, folder)
     # On a CPU two runs at once are faster in total: much of each is single-threaded.
     jobs = 1 if torch.cuda.is_available() else 2

@@ -46,7 +46,7 @@ def mesh(
         f"{output}: {len(surface.faces)} triangles, voxels of {surface.metadata['voxel']:.3g}. {place(run.frame)}"
     )
     if not run.frame.metric and output.suffix.lower() in METRE_FORMATS:
-        console.print(f"A {output.suffix} file is in metres, so programs take this unit for the metre: scale it there.")
+        console.print(f"A {output.suffix} file is in metres, so programs take this unit as the metre: scale it there.")
     if rows:
         console.print(rich_table(rows, SURFACE_COLUMNS, console.width, "Mesh in the held-out views, against"))
     if "area_near_shell" in metrics:

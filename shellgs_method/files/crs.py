@@ -79,7 +79,9 @@ def given_crs(text: str) -> str:
     """
     crs = known_crs(text)
     if crs is None:
-        raise SceneError(f"--crs {text} is no coordinate reference system that PROJ knows: give a code, as EPSG:25832")
+        raise SceneError(
+            f"--crs {text} is not a coordinate reference system that PROJ knows: give a code, as EPSG:25832"
+        )
     if crs.is_geographic:
         raise SceneError(f"--crs {text} is in degrees: give the shell's own system, which must be in metres or feet")
     return name_of(crs)

@@ -174,14 +174,14 @@ def read_splats(path: Path) -> Splats:
         or len(names) != sum(line[:1] == ["property"] for line in lines)
     ):
         raise SceneError(
-            f"{path} is damaged, or no ply of Gaussians in binary floats: write it again by shellgs splats"
+            f"{path} is damaged, or not a ply of Gaussians in binary floats: write it again by shellgs splats"
         )
     rows = np.frombuffer(body, "<f4").reshape(count, len(names)).copy()
     table = dict(zip(names, torch.from_numpy(rows).T, strict=True))
     wanted = [("x", "y", "z"), *(tuple(f"{name}_{k}" for k in range(n)) for name, n in (("rot", 4), ("scale", 3)))]
     wanted += [("opacity",), tuple(f"f_dc_{k}" for k in range(3)), tuple(f"f_rest_{k}" for k in range(rest))]
     if missing := [name for group in wanted for name in group if name not in table]:
-        raise SceneError(f"{path} is no ply of Gaussians: it has no {missing[0]}")
+        raise SceneError(f"{path} is not a ply of Gaussians: it has no {missing[0]}")
     means, quats, scales, opacities, first, others = (
         torch.stack([table[name] for name in group], dim=1) if group else torch.zeros(count, 0) for group in wanted
     )

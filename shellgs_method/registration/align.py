@@ -178,7 +178,7 @@ def place_by_picks(path: Path, views: Sequence[View], place: ShellPlace, unplace
     fitted = [point.is_used for point in picked if point.is_sharp and not point.held_out]
     if 2 * sum(fitted) < len(fitted):
         raise SceneError(
-            f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs, which three do by "
+            f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs, as three may by "
             "chance: are they of the same points, and all axes of the shell in one unit?"
         )
     alignment = replace(unplaced, shell_to_scene=matrix, source=f"picks in {path.name}")
@@ -242,14 +242,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
     if held.were_straight:
         why = (
-            f"do not fit the shell better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are "
-            "asked)"
+            f"do not fit the shell significantly better with it ({held.gain:.1f} standard errors; {SIGNIFICANT:g} "
+            "are required)"
             if held.points >= FEW
             else f"are too few to decide ({FEW} are needed)"
         )
         sentence = (
-            f"The cameras are left as they are: {held.points} points near the shell, held out of their adjustment, "
-            f"{why}."
+            f"The cameras are left as they are: {held.points} points near the shell, held out of the adjustment, {why}."
         )
         return placement.then(sentence), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
@@ -321,7 +320,7 @@ def up_in_words(alignment: Alignment) -> str:
     if alignment.up is None:
         usual = name_of(usual_up(alignment.shells))
         return f"The cameras do not determine which way is up: it is taken to be {usual} of the shell's file."
-    return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
+    return f"According to the cameras, up is {name_of(alignment.up)} of the shell's file."
 
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:

@@ -93,15 +93,15 @@ def _camera_path(file: TextIO) -> dict[str, Any]:
         try:
             path = json.load(file)
         except ValueError as error:
-            raise SceneError(f"{file.name} is no camera path: it is not json") from error
+            raise SceneError(f"{file.name} is not a camera path: it is not json") from error
         if not isinstance(path, dict) or not isinstance(path.get("camera_path"), list):
             raise SceneError(
-                f"{file.name} is no camera path, as ns-viewer's Render tab generates it; ns-render dataset renders the "
-                "photographs' own views"
+                f"{file.name} is not a camera path, as ns-viewer's Render tab generates it; ns-render dataset "
+                "renders the photographs' own views"
             )
         cameras = path["camera_path"]
         if not cameras:
-            raise SceneError(f"{file.name} has a path of no cameras: add a second keyframe, and generate it again")
+            raise SceneError(f"{file.name} has a path without cameras: add a second keyframe, and generate it again")
         path["camera_type"] = str(path.get("camera_type") or "perspective").lower()
         check_camera_type(path["camera_type"])
         angled = path["camera_type"] != "equirectangular"

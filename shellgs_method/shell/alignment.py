@@ -341,7 +341,7 @@ def _direction(vector: np.ndarray) -> Float64[np.ndarray, " 3"]:
     vector = np.asarray(vector, dtype=np.float64)
     length = np.linalg.norm(vector) if vector.shape == (3,) else np.nan
     if not 0 < length < np.inf:
-        raise SceneError("the alignment's up is no direction of three numbers, such as [0, 0, 1]")
+        raise SceneError("the alignment's up is not a direction of three numbers, such as [0, 0, 1]")
     unit = vector if abs(length - 1) < 1e-12 else vector / length  # again and again, it would change by rounding
     nearest = np.round(unit)
     return nearest if np.abs(unit - nearest).max() < 1e-9 else unit

@@ -193,7 +193,7 @@ class Reconstruction:
         if self.shell is None:
             log(
                 f"{self.scene} has no aligned shell: the frame is the scene's, rotated upright by the cameras' up "
-                "axes, its unit is unknown, so that simulators take it for the metre, and the collision geometry comes "
+                "axes, its unit is unknown, so simulators take it as the metre, and the collision geometry comes "
                 "from the reconstruction alone."
             )
 

@@ -98,7 +98,7 @@ def test_faces_are_named_by_panorama_and_belong_together(tmp_path):
 
 def test_an_image_that_is_not_twice_as_wide_as_high_is_refused(tmp_path):
     photograph(64, 64).save(tmp_path / "stereo.jpg")
-    with pytest.raises(SceneError, match=r"stereo.jpg is 64x64 pixels, but a panorama .*\(mono\)"):
+    with pytest.raises(SceneError, match=r"stereo.jpg is 64x64 pixels, but a panorama .*mono equirectangular"):
         add_faces(tmp_path / "stereo.jpg", tmp_path, "stereo.jpg", 16)
 
 

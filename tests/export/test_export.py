@@ -128,7 +128,7 @@ def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(
     assert record["up"] == "y"
     shell_frame = TrainedRun(model_of(trainer), data_of(trainer)).frame
     offset = " ".join(f"{value:.0f}" for value in shell_frame.offset)
-    assert f"less {offset}. Turned, so that y is up." in " ".join(capsys.readouterr().out.split())
+    assert f"minus {offset}. Turned, so that y is up." in " ".join(capsys.readouterr().out.split())
     frame, motion = shell_frame.turned(np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(record["turned"], motion[:3, :3])
     np.testing.assert_allclose(record["to_scene"], frame.to_scene)

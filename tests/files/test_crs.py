@@ -141,7 +141,7 @@ def test_a_system_is_known_by_its_code_and_no_word_is_taken_for_one(text, system
 def test_the_unit_of_a_system_is_that_of_its_shell_unless_another_is_given(caplog):
     scan, foot = (Path("scan.las"),), 1200 / 3937
     assert metres_of("EPSG:2229", 1.0, scan) == pytest.approx(foot, rel=1e-12)
-    assert "California zone 5 (ftUS), is in US survey foot: its unit is taken for 0.30480061 m" in caplog.text
+    assert "California zone 5 (ftUS), is in US survey foot: its unit is taken as 0.30480061 m" in caplog.text
     assert metres_of("EPSG:2229", 0.001, scan) == 0.001
     assert [metres_of(system, 1.0, scan) for system in ("", UTM, "EPSG:5555")] == [1, 1, 1]
     assert metres_of("EPSG:2229", 1.0, (Path("a.ifc"),)) == 1  # is read in metres

@@ -423,7 +423,7 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
         (lambda text: BOMB + text, "it declares a document type"),
         (lambda text: text.replace("CityModel", "Model"), "is XML, but not CityGML"),
         (lambda text: '<a:FeatureCollection xmlns:a="b"><a:member/></a:FeatureCollection>', "is XML, but not CityGML"),
-        (lambda text: text.replace("410000.0 ", "", 1), "no positions of 3 coordinates"),
+        (lambda text: text.replace("410000.0 ", "", 1), "not positions of 3 coordinates"),
         (lambda text: text.replace("bldg:Building", "veg:PlantCover"), "has no surface of a building"),
     ],
 )

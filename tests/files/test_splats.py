@@ -118,8 +118,8 @@ def test_a_ply_is_read_as_it_was_written(tmp_path, count, degree, discs):
         (lambda content: content[:-1], "is damaged"),
         (lambda content: b"solid", "is damaged"),
         (lambda content: content.replace(b"property float opacity", b"property float density"), "it has no opacity"),
-        (lambda content: content.replace(b"property float x", b"property double x"), "is damaged, or no ply"),
-        (lambda content: content.replace(b"property float nx", b"property float f_rest_99"), "is damaged, or no ply"),
+        (lambda content: content.replace(b"property float x", b"property double x"), "is damaged, or not"),
+        (lambda content: content.replace(b"property float nx", b"property float f_rest_99"), "is damaged, or not"),
     ],
 )
 def test_a_file_that_is_no_ply_of_gaussians_is_refused(tmp_path, change, message):

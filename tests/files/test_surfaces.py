@@ -823,14 +823,14 @@ def test_a_comment_may_name_the_columns(tmp_path: Path, comments: list[str], for
 def test_a_column_of_points_numbers_is_said(tmp_path: Path, caplog):
     (tmp_path / "a.xyz").write_text("\n".join(f"{k + 1000} {line}" for k, line in enumerate(LINES)))
     read_geometry(tmp_path / "a.xyz")
-    assert "its first column (1000) is taken for the points' numbers" in caplog.text
+    assert "its first column (1000) is taken as the points' numbers" in caplog.text
 
 
 @pytest.mark.parametrize("start", [319_000.0, 1.7e9])
 def test_a_column_of_times_is_said(tmp_path: Path, caplog, start: float):
     (tmp_path / "a.xyz").write_text("\n".join(f"{start + 3e-6 * k:.6f} {line}" for k, line in enumerate(LINES)))
     np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
-    assert f"its first column ({start:.6f}) is taken for times, and X for the second" in caplog.text
+    assert f"its first column ({start:.6f}) is taken as times, and X as the second" in caplog.text
 
 
 @pytest.mark.parametrize("form", ["{:.3f}", "{!r}"])
@@ -854,7 +854,7 @@ def test_rows_and_columns_of_a_scanner_come_before_x(tmp_path: Path, caplog, sep
     lines = [separator.join(f"{k % 20} {k // 20} {line}".split()) for k, line in enumerate(LINES)]
     (tmp_path / "a.xyz").write_text("\n".join(lines))
     np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
-    assert "its first two columns are taken for the scanner's rows and columns" in caplog.text
+    assert "its first two columns are taken as the scanner's rows and columns" in caplog.text
 
 
 def test_a_raster_of_whole_metres_with_colours_or_normals_has_no_rows_and_columns(tmp_path: Path, caplog):
@@ -943,7 +943,7 @@ def test_a_ptx_is_moved_by_its_matrices_and_tells_its_scanners(
         (lambda lines: [*lines[:5], *lines[6:]], "a scan does not begin with its size"),
         (lambda lines: [*lines, "1 2 3 0.5"], "cannot be read"),
         (lambda lines: ["-10", *lines[1:]], "a scan does not begin with its size"),
-        (lambda lines: [*lines[:6], "1 0 0 4", *lines[7:9], "5 0 0 1", *lines[10:]], "the matrix of a scan is no 4x4"),
+        (lambda lines: [*lines[:6], "1 0 0 4", *lines[7:9], "5 0 0 1", *lines[10:]], "the matrix of a scan is not"),
     ],
 )
 def test_a_damaged_ptx_is_refused(tmp_path: Path, change: Callable[[list[str]], list[str]], words: str):

@@ -81,8 +81,8 @@ def test_a_path_of_other_cameras_is_rendered(loaded, tmp_path, kind):
 
 
 PATHS: dict[str, tuple[dict[str, Any], str]] = {
-    "one keyframe": ({"camera_path": []}, "has a path of no cameras: add a second keyframe"),
-    "cameras of a scene": ({"camera_path": None, "frames": []}, "is no camera path.*ns-render dataset"),
+    "one keyframe": ({"camera_path": []}, "has a path without cameras: add a second keyframe"),
+    "cameras of a scene": ({"camera_path": None, "frames": []}, "is not a camera path.*ns-render dataset"),
     "no angle": ({"camera_path": [{"camera_to_world": POSE}]}, "fov must be a number above 0 and below 180.*None"),
     "half around": ({"camera_path": [{"camera_to_world": POSE, "fov": 180}]}, "below 180, and is 180"),
     "three rows": ({"camera_path": [{"camera_to_world": POSE[:12], "fov": 50}]}, "must be 16 finite numbers"),

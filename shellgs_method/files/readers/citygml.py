@@ -224,5 +224,5 @@ class _Model:
 
 def _positions(numbers: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, "N 3"]:
     if len(numbers) % 3:
-        raise ValueError(f"a ring has {len(numbers)} numbers, which are no positions of 3 coordinates")
+        raise ValueError(f"a ring has {len(numbers)} numbers, which are not positions of 3 coordinates")
     return numbers.reshape(-1, 3)

@@ -340,7 +340,7 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     import ifcopenshell.util.unit
 
     if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
-        notice(f"{path}: it names no unit of length: its numbers are taken for metres.")
+        notice(f"{path}: it names no unit of length: its numbers are taken as metres.")
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points

@@ -116,7 +116,7 @@ def read_off(path: Path) -> Geometry:
     text = re.sub(r"#.*", "", with_nan(path.read_text(encoding_of(path), errors="replace")))
     form, _, rest = text.lstrip().partition("OFF")
     if not re.fullmatch(r"(ST)?C?N?", form) or re.match(r"\s+BINARY", rest):
-        raise SceneError(f"the shell {path} is no OFF of text with three coordinates: export it as PLY or OBJ")
+        raise SceneError(f"the shell {path} is not an OFF of text with three coordinates: export it as PLY or OBJ")
     lines = [line.split() for line in rest.splitlines() if line.strip()]
     vertex_count, face_count = (int(word) for word in lines[0][:2])
     vertices, faces = lines[1 : 1 + vertex_count], lines[1 + vertex_count : 1 + vertex_count + face_count]

@@ -84,7 +84,7 @@ def read_ptx(path: Path) -> Iterator[Points]:
             if matrix[:3, 3].any() and not matrix[3, :3].any():  # for column vectors, as some programs write it
                 matrix = matrix.T
             if not np.allclose(matrix[:, 3], (0, 0, 0, 1)):
-                raise ValueError("the matrix of a scan is no 4x4 matrix of a rotation and a translation")
+                raise ValueError("the matrix of a scan is not a 4x4 matrix of a rotation and a translation")
             if not np.array_equal(matrix, np.eye(4)):
                 yield Points(NO_POINTS, scanners=matrix[3:, :3])
             total += rays
@@ -194,13 +194,13 @@ def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
     if width >= 4 and all(numeric[1:4]):
         varies = len({row[0] for row in rows}) > 1
         if not numeric[0] or (varies and whole[0] and not any(whole[1:4])):
-            notice(f"{path}: its first column ({rows[0][0]}) is taken for the points' numbers, and X for the second.")
+            notice(f"{path}: its first column ({rows[0][0]}) is taken as the points' numbers, and X as the second.")
             return [1, 2, 3]
         if all(numeric[:4]) and _is_time(rows):
-            notice(f"{path}: its first column ({rows[0][0]}) is taken for times, and X for the second.")
+            notice(f"{path}: its first column ({rows[0][0]}) is taken as times, and X as the second.")
             return [1, 2, 3]
     if all(whole[:2]) and all(numeric) and len(numeric) == 5 and not any(whole[2:]) and _is_raster(rows):
-        notice(f"{path}: its first two columns are taken for the scanner's rows and columns, and X for the third.")
+        notice(f"{path}: its first two columns are taken as the scanner's rows and columns, and X as the third.")
         return [2, 3, 4]
     if width < 3 or not all(numeric[:3]):
         raise SceneError(
