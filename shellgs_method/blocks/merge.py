@@ -53,7 +53,7 @@ class BlockRun:
         """
         run = cls(open_run(path), path)
         if run.dataparser.block is None or getattr(run.config.pipeline.model, "coarse", None) is None:
-            raise SceneError(f"{path} is no run of a block from a coarse run: name those of the blocks alone")
+            raise SceneError(f"{path} is not a run of a block from a coarse run: name those of the blocks alone")
         _ = run.checkpoint
         return run
 

@@ -91,7 +91,7 @@ def cast(
         raise SceneError(f"--{'truth' if truth == () else 'shell'} names no file: give one or more, or leave it out")
     files = truth or shell or ()
     if truth and shell:
-        raise SceneError("the truth is cast after the shell: give --shell or --truth")
+        raise SceneError("the ground truth is cast after the shell: give --shell or --truth")
     if (matrix and not files) or (shell and not matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
     if matrix is None and (any(global_shift) or metres_per_shell_unit != 1 or crs):

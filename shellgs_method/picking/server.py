@@ -167,7 +167,7 @@ def _argument(name: str, value: Any) -> Any:
     if name == "pixel":
         return tuple(_numbers(value, 2).tolist())
     if not isinstance(value, str):
-        raise TypeError(f"{name} is no text")
+        raise TypeError(f"{name} is not text")
     return value
 
 

@@ -167,8 +167,8 @@ class PicksFile:
         picks, elsewhere = _picks_of(table, views, crs)
         if elsewhere:
             raise SceneError(
-                f"{len(elsewhere)} lines of {path} are of photographs that are not in the scene, {elsewhere[0][1]} for "
-                "example: give a copy without them, as the file is written anew; quote names with spaces"
+                f"{len(elsewhere)} lines of {path} are of photographs that are not in the scene, {elsewhere[0][1]} "
+                "for example: give a copy without them, as the file is rewritten; quote names with spaces"
             )
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
         for line in table.others:

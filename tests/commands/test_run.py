@@ -188,7 +188,7 @@ def test_settings_that_notepad_saved_are_read_in_any_language(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ([], "there is no scene.run to go on with: give a video (or a folder of photographs) and a scan"),
+        ([], "there is no scene.run to continue with: give a video (or a folder of photographs) and a scan"),
         (["{photographs}", "shell.ply", "--picks", "no.txt"], "no.txt does not exist"),
         (["{photographs}", "shell.ply", "--iterations", "0"], "--iterations cannot be 0"),
         (["{photographs}", "shell.ply", "--method", "shelgs"], "there is no method 'shelgs'"),

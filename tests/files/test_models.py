@@ -511,7 +511,7 @@ def test_a_map_conversion_in_the_units_of_the_model_is_said(tmp_path: Path, capl
     crs.MapUnit = file.add("IfcConversionBasedUnit", length, "LENGTHUNIT", "METER", foot)
     file.add("IfcMapConversion", file.context, crs, *(NATIONAL * 1000).tolist(), 1.0, 0.0, None)
     assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
-    assert "the METER of its map is 0.3048 m by its definition: it is taken for a metre" in caplog.text
+    assert "the METER of its map is 0.3048 m by its definition: it is taken as a metre" in caplog.text
     assert "its map conversion is in the units of the model, of 0.001 m" in caplog.text
 
 

@@ -415,6 +415,6 @@ def _metres_of_map(unit: Any, path: Path) -> float | None:
         return _FOOT if "FOOT" in unit.upper() or "FEET" in unit.upper() else 1.0
     metres = ifcopenshell.util.unit.get_unit_scale(unit)
     if unit.Name.upper() in ("METER", "METRE") and metres == _FOOT:  # of Revit
-        notice(f"{path}: the {unit.Name} of its map is {metres:g} m by its definition: it is taken for a metre.")
+        notice(f"{path}: the {unit.Name} of its map is {metres:g} m by its definition: it is taken as a metre.")
         return 1.0
     return metres

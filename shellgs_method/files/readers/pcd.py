@@ -56,7 +56,7 @@ def _points(file: IO[bytes], fields: dict[str, list[str]], path: Path) -> Iterat
     columns = [_Column(np.dtype("<" + kinds[k]), sum(sizes[:k]), sum(counts[:k])) for k in where]
     points = int(fields["POINTS"][0]) if "POINTS" in fields else int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
     if [float(value) for value in fields.get("VIEWPOINT", _IDENTITY)] != _IDENTITY:
-        notice(f"{path}: its VIEWPOINT is not applied: the points are taken for those of one frame.")
+        notice(f"{path}: its VIEWPOINT is not applied: the points are taken as those of one frame.")
     read = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}[fields["DATA"][0].lower()]
     for table in read(file, columns, points, sizes):
         yield Points(table[:, :3], table[:, 3:] if has_normals else None)
