@@ -78,9 +78,9 @@ def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:
                 unknown.append(name)
     if len(unknown) > 1:
         notice(
-            f"{len(unknown)} of {len(names)} photographs, {unknown[0]} for example, do not say in EXIF with which lens "
-            "they were taken, as those sent by messengers: those of one size share a camera. If several phones took "
-            "them, or the zoom changed, capture the original files, or use --cameras folder or image."
+            f"{len(unknown)} of {len(names)} photographs, {unknown[0]} for example, do not name their lens in EXIF, "
+            "like those sent by messengers: those of one size share a camera. If several phones took them, or the "
+            "zoom changed, capture the original files, or use --cameras folder or image."
         )
 
 

@@ -84,7 +84,7 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
         there = f", but {counted}" if counted else ""
         raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
     if counted:
-        notice(f"{others.total()} files of {folder} are no photographs, and are left out ({counted}).")
+        notice(f"{others.total()} files of {folder} are not photographs, and are left out ({counted}).")
 
 
 def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
@@ -104,9 +104,9 @@ def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
     stems = Counter(path.with_suffix("") for path in kept)
     if twins := [path.name for path in kept if stems[path.with_suffix("")] > 1]:
         notice(
-            f"{len(twins)} photographs of {folder} differ from another's name in their suffix alone ({twins[0]} and "
-            f"{twins[1]}, for example): if they are one photograph in two formats, move one of the two away, or "
-            "metrics of held-out photographs are too good."
+            f"{len(twins)} photographs of {folder} have the name of another with another suffix ({twins[0]} and "
+            f"{twins[1]}, for example): if they are one photograph in two formats, remove one of the two, or metrics "
+            "of held-out photographs will be too good."
         )
     _tell_of_versions(folder, [path for path in kept if stems[path.with_suffix("")] == 1])
     return kept
@@ -157,9 +157,9 @@ def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
         first, second = sorted(versions[0])[:2]
         count = sum(map(len, versions)) - len(versions)
         notice(
-            f"{count} photographs of {folder} were taken at the very moment of others "
-            f"({second.name} at that of {first.name}, for example): if they are edited versions, move one of the two "
-            "away, or metrics of held-out photographs are too good."
+            f"{count} photographs of {folder} were taken at the same moment as others ({second.name} at that of "
+            f"{first.name}, for example): if they are edited versions, remove one of the two, or metrics of held-out "
+            "photographs will be too good."
         )
 
 
@@ -182,8 +182,8 @@ def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
     ]
     if copies:
         notice(
-            f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, for "
-            "example): of copies, move one of the two away, or metrics of held-out photographs are too good."
+            f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, "
+            "for example): remove the copies, or metrics of held-out photographs will be too good."
         )
 
 
@@ -206,9 +206,9 @@ def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> N
     steps = [abs(a - b) for place in places for a, b in pairwise(place)]
     if sum(step <= overlap for step in steps) < _IN_ORDER * len(steps):
         notice(
-            f"The names of the photographs, {names[0]} for example, do not follow the order in which they were taken, "
-            "by EXIF, but are what neighbours are looked for by: cameras may be metres off. Rename them by time, or "
-            "use --matching exhaustive."
+            f"The names of the photographs, {names[0]} for example, do not follow the order in which they were "
+            "taken, according to EXIF, but neighbours are matched by name: cameras may be metres off. Rename them "
+            "by time, or use --matching exhaustive."
         )
 
 

@@ -80,15 +80,15 @@ class _Verdict:
         sees_little = points * seen_in < LEAST_SEEN * registered
         if is_flat and (sees_little or registered < LEAST_SHARE * len(names)):
             raise SceneError(
-                f"the photographs of {self.source} show no parallax: almost any two differ by a turn of the camera "
-                f"alone, or show one plane, and the cameras of {registered} of {len(names)} were found, by {points} "
-                "points. Walk sideways along the building, a step between photographs; neither stand nor turn on the "
-                "spot"
+                f"the photographs of {self.source} show no parallax: almost all pairs differ only by a rotation of "
+                f"the camera, or show one plane, and the cameras of {registered} of {len(names)} were found, with "
+                f"{points} points. Walk sideways along the building, one step between photographs; do not stand "
+                "still or turn on the spot"
             )
         if is_flat:
             notice(
-                f"The photographs of {self.source} show hardly any parallax: was the camera turned on the spot, or is "
-                "all it saw one plane? Look at the cameras' path before you go on."
+                f"The photographs of {self.source} show hardly any parallax: was the camera turned on the spot, or "
+                "did it see one plane only? Check the cameras' path before you continue."
             )
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
             groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
@@ -105,9 +105,9 @@ class _Verdict:
             )
         if sees_little:
             raise SceneError(
-                f"the photographs of {self.source} show too little to find cameras by: only {points} points, each in "
-                f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, "
-                f"which show at least {LEAST_SEEN} points each{self._said_of_masks()}"
+                f"the photographs of {self.source} show too few points to find their cameras: only {points} points, "
+                f"each in {seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the "
+                f"building, which show at least {LEAST_SEEN} points each{self._said_of_masks()}"
             )
 
     def tell_of_doubts(self) -> None:
@@ -115,18 +115,17 @@ class _Verdict:
         if torn := self.largest.get("torn"):
             slower = "more --frames, or a slower walk, help" if self.source.is_file() else "more photographs there help"
             notice(
-                f"The cameras found for {self.source} contradict nearly all that {' and '.join(torn)} and their "
-                f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
-                f"{slower}."
+                f"The cameras found for {self.source} contradict nearly all matches between {' and '.join(torn)} and "
+                f"their neighbours: one side may be metres off. Check the cameras' path; {slower}."
             )
         if zoomed := self.largest.get("zoomed"):
             change, short, long, behind = zoomed
-            step = f" (in a step: {behind} is the first behind it)" if behind else ""
+            step = f" (in a step: {behind} is the first after it)" if behind else ""
             notice(
                 f"The focal length of {self.source} seems to change by {change:.0%}, between {short} and {long} for "
-                f"example{step}, where one camera is taken for all: by zooming, another lens, cropping, as "
-                "stabilisation does, or the distortion of a fisheye lens. Cameras may be metres off. Record without "
-                "these; photographs of two lenses go into a folder each, with --cameras folder."
+                f"example{step}, but all share one camera: the cause may be zooming, another lens, cropping, as by "
+                "stabilisation, or the distortion of a fisheye lens. Cameras may be metres off. Record without "
+                "these; put photographs of two lenses into a folder each, with --cameras folder."
             )
         else:
             for lens in self.largest.get("lenses", []):
@@ -139,9 +138,9 @@ class _Verdict:
             if names and len(model["names"]) >= LEAST_REGISTERED:
                 faults = (each["fault"] for each in self.found.get("apart", []) if set(names) & set(each["names"]))
                 notice(
-                    f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, did not join the others, "
-                    f"{next(faults, 'too little overlap')}: take some on the way from one pass to the other, in small "
-                    "steps, and with a corner of the building in view"
+                    f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, could not be joined with the "
+                    f"others, {next(faults, 'too little overlap')}: take some on the way from one pass to the other, in "
+                    "small steps, and with a corner of the building in view"
                 )
 
     def _said_of_masks(self) -> str:
@@ -163,8 +162,8 @@ def _tell_of_a_doubtful_lens(names: list[str], focal: Sequence[float], exif: flo
     if is_other or max(across, down) > _OFF_SQUARE * min(across, down):
         said = f", in EXIF {exif:.0f}" if exif else ""
         notice(
-            f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} "
-            f"pixels across and {down:.0f} down were found{said}. If they were not cropped, stretched or "
-            "stabilised, they do not tell it, as where all look straight at one plane, or ahead along a street, "
-            "and depths are off by as much: take some from the side, at angles to the wall."
+            f"The focal length of {len(names)} photographs, {names[0]} for example, is in doubt: {across:.0f} pixels "
+            f"across and {down:.0f} down were found{said}. If they were not cropped, stretched or stabilised, they "
+            "do not determine it, as when all look straight at one plane, or ahead along a street, and depths are "
+            "off by as much: take some at an angle to the wall."
         )

@@ -26,7 +26,7 @@ class Recipe:
         tyro.conf.Positional,
         tyro.conf.arg(metavar="[VIDEO SHELL [SHELL ...]]", help_behavior_hint=""),
     ] = ()
-    """Video or folder of photographs, then the files of the shell. Not again when the run goes on."""
+    """Video or folder of photographs, then the files of the shell. Not needed to resume a run."""
     picks: Optional[Path] = None
     """Text file of picked points, as `shellgs align` takes it."""
     matrix: Optional[Path] = None
@@ -132,9 +132,9 @@ def settled(recipe: Recipe, file: Path) -> Recipe:
     if not file.is_file():
         if not recipe.sources:
             others = [f"--scene {shlex.quote(str(other.with_suffix('')))}" for other in file.parent.glob("*.run")]
-            hint = f"; or go on with {' or '.join(others)}" if others else ""
+            hint = f"; or continue with {' or '.join(others)}" if others else ""
             raise SceneError(
-                f"there is no {file} to go on with: give a video (or a folder of photographs) and a scan{hint}"
+                f"there is no {file} to continue with: give a video (or a folder of photographs) and a scan{hint}"
             )
         recipe.check()
         recipe.save(file)

@@ -215,7 +215,7 @@ def _train(recipe: Recipe, scene: Path, results: Path, done: Record) -> Run:
     if not done.has("evaluation", measured_by):
         trained.metrics().unlink(missing_ok=True)
     if compare(runs, partial(launch_locally, jobs=1, console=console), results, console).failures:
-        raise SystemExit("shellgs: the training failed; the end of its output is above. The same command goes on.")
+        raise SystemExit("shellgs: the training failed; the end of its output is above. The same command continues.")
     done.note("evaluation", measured_by)
     return trained
 

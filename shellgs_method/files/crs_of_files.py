@@ -199,8 +199,8 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         return given
     if crs.is_geocentric:
         raise SceneError(
-            f"{crs.name} counts from the middle of the Earth, and its axes are neither level nor vertical: convert the "
-            "shell to a system of its region, such as UTM, or name that with --crs"
+            f"{crs.name} is geocentric, and its axes are neither level nor vertical: convert the shell to a system "
+            "of its region, such as UTM, or name that with --crs"
         )
     if _is_of_the_earth(crs):
         raise SceneError(
@@ -213,7 +213,7 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
     name, metres = next(iter(units.items()))
     if given != 1 or abs(metres - 1) < 1e-9:
         return given
-    notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken for {metres:.9g} m.")
+    notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken as {metres:.9g} m.")
     return metres
 
 

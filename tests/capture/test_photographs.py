@@ -280,7 +280,7 @@ def test_photographs_that_do_not_say_their_lens_are_told(tmp_path, caplog):
     tell_of_unknown_lenses(tmp_path, ["0.jpg", "1.jpg", "2.jpg"])
     assert caplog.text == ""
     tell_of_unknown_lenses(tmp_path, [f"{k}.jpg" for k in range(5)])
-    assert "3 of 5 photographs, 2.jpg for example, do not say" in caplog.text
+    assert "3 of 5 photographs, 2.jpg for example, do not name their lens" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -665,7 +665,7 @@ def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, 
     cloud(scene)
     store_turned(scene, 3)
     views_of(scene)
-    assert "nothing tells whether their cameras are of the upright ones" in caplog.text
+    assert "whether their cameras are those of the upright photographs is unknown" in caplog.text
 
 
 def test_a_square_photograph_is_turned_for_an_upright_camera(scene):
@@ -952,7 +952,7 @@ def test_names_in_the_code_page_of_the_machine_are_found(scene, caplog, name, pa
     assert [view.name for view in views].count(f"images/{name}.png") == 1
     assert f"is images/{name}.png, for example" in caplog.text
     (scene / "images" / f"{name}.png").unlink()
-    with pytest.raises(SceneError, match="whose letters are not UTF-8, and none here fits: use plain letters"):
+    with pytest.raises(SceneError, match="which is not UTF-8, and matches none here: use plain letters"):
         views_of(scene)
 
 
