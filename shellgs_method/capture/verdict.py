@@ -138,9 +138,9 @@ class _Verdict:
             if names and len(model["names"]) >= LEAST_REGISTERED:
                 faults = (each["fault"] for each in self.found.get("apart", []) if set(names) & set(each["names"]))
                 notice(
-                    f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, could not be joined with the "
-                    f"others, {next(faults, 'too little overlap')}: take some on the way from one pass to the other, in "
-                    "small steps, and with a corner of the building in view"
+                    f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, could not be joined with "
+                    f"the others, {next(faults, 'too little overlap')}: take some on the way from one pass to the "
+                    "other, in small steps, and with a corner of the building in view"
                 )
 
     def _said_of_masks(self) -> str:

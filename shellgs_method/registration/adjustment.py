@@ -142,6 +142,31 @@ class Adjustment:
     noise: float
     held_out: HeldOut
 
+    @property
+    def in_words(self) -> str:
+        """How far the cameras moved, or why they are left as they are."""
+        held = self.held_out
+        if held.were_straight:
+            why = (
+                f"do not fit the shell significantly better with it ({held.gain:.1f} standard errors; {SIGNIFICANT:g} "
+                "are required)"
+                if held.points >= FEW
+                else f"are too few to decide ({FEW} are needed)"
+            )
+            return (
+                f"The cameras are left as they are: {held.points} points near the shell, held out of the adjustment, "
+                f"{why}."
+            )
+        before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
+        moved, deviation = (100 * np.array([*by.values()]) for by in (self.moved, self.deviations))
+        return (
+            f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
+            f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of "
+            f"the adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their "
+            f"keypoints, {held.pixels[0]:.2f} px before (medians); they fit the shell better by {held.gain:.1f} "
+            "standard errors."
+        )
+
 
 def adjusted(
     surface: ShellSurface,

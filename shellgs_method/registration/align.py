@@ -23,7 +23,7 @@ from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
+from shellgs_method.registration.adjustment import Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
 from shellgs_method.registration.geotags import REACH, GeoTags
@@ -238,31 +238,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
             f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which "
             "bent cameras do not explain; align it better first, with --picks and --refine"
         )
-    held = adjustment.held_out
-    before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
-    if held.were_straight:
-        why = (
-            f"do not fit the shell significantly better with it ({held.gain:.1f} standard errors; {SIGNIFICANT:g} "
-            "are required)"
-            if held.points >= FEW
-            else f"are too few to decide ({FEW} are needed)"
-        )
-        sentence = (
-            f"The cameras are left as they are: {held.points} points near the shell, held out of the adjustment, {why}."
-        )
-        return placement.then(sentence), None
+    if adjustment.held_out.were_straight:
+        return placement.then(adjustment.in_words), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
-    moved, deviation = (100 * np.array([*by.values()]) for by in (adjustment.moved, adjustment.deviations))
-    sentence = (
-        f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
-        f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
-        f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
-        f"{held.pixels[0]:.2f} px before (medians); they fit the shell better by {held.gain:.1f} standard errors."
-    )
     found = replace(
         alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
     )
-    return placement.then(sentence, alignment=found), adjustment
+    return placement.then(adjustment.in_words, alignment=found), adjustment
 
 
 def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) -> Placement:
