@@ -478,6 +478,28 @@ def test_an_ifc_is_cast_to_a_millimetre_with_its_openings_as_they_are(tmp_path: 
     assert "1 IfcFurnishingElement, 3 IfcOpeningElement, 1 IfcSpace" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("schema", "kind"), [("IFC4", "IfcProjectLibrary"), ("IFC4", "IfcProject"), ("IFC2X3", "IfcProject")]
+)
+def test_the_unit_of_an_ifc_is_that_of_its_project_beside_another(tmp_path: Path, schema: str, kind: str):
+    """Millimetres were taken for metres, without a word, beside a library."""
+    file = made.ifc_house(schema=schema, unit=0.001)
+    (project,) = file.model.by_type("IfcProject")
+    other = file.model.create_entity(kind, GlobalId="1SutvPaeH8EBtxrmG2k_Kh")
+    if kind == "IfcProject":
+        other.UnitsInContext = project.UnitsInContext
+    assert_cast_as(file.save(tmp_path / "a.ifc"), made.ifc_house_faces())
+
+
+def test_projects_of_an_ifc_in_different_units_are_refused(tmp_path: Path):
+    file = made.ifc_house(unit=0.001)
+    metre = file.model.create_entity("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE")
+    units = file.model.create_entity("IfcUnitAssignment", Units=[metre])
+    file.model.create_entity("IfcProject", GlobalId="1SutvPaeH8EBtxrmG2k_Kh", UnitsInContext=units)
+    with pytest.raises(SceneError, match="holds 2 projects in different units"):
+        read_geometry(file.save(tmp_path / "a.ifc"))
+
+
 SCALES = [
     *((0.001, 0.001, None), (0.001, 0.001, 1.0), (1.0, 1.0, None), (0.001, 1.0, 1.0), (1.0, 0.9996, 1.0)),
     *((1.0, 0.9996, None), (0.3048, 0.3048, None), (0.001, 1000.0, None), (0.001, 1000.0, 1.0)),

@@ -103,8 +103,7 @@ def read_ifc(path: Path) -> Geometry:
         raise ValueError("it does not end as an IFC does")
     ifcopenshell.get_log()  # which empties it
     model: Any = _opened(path, ifcopenshell)
-    if not model.by_type("IfcProject"):
-        raise ValueError("it has no IfcProject")
+    _one_project(path, model)
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     _complete(path, model, products)
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
@@ -204,6 +203,29 @@ def _read(shape: Any, own: SurfaceClass | None, glazed: bool) -> _Part:
     if glazed:
         classes[_glass(shape.geometry, len(faces))] = SurfaceClass.WINDOW
     return _Part(shape.id, vertices, faces, classes)
+
+
+def _one_project(path: Path, model: Any) -> None:
+    """Leave the model one project: beside another, or a library, ifcopenshell takes any unit for metres and radians.
+
+    Raises:
+        SceneError: there are several, in different units.
+        ValueError: there is none.
+    """
+    import ifcopenshell.util.unit
+
+    projects = model.by_type("IfcProject")
+    if not projects:
+        raise ValueError("it has no IfcProject")
+    units = [unit for each in projects if each.UnitsInContext for unit in each.UnitsInContext.Units]
+    lengths = [unit for unit in units if getattr(unit, "UnitType", None) == "LENGTHUNIT"]
+    if len({ifcopenshell.util.unit.get_unit_scale(unit) for unit in lengths}) > 1:
+        raise SceneError(
+            f"the shell {path} holds {len(projects)} projects in different units: export each to a file of its own"
+        )
+    for each in model.by_type("IfcProject" if model.schema == "IFC2X3" else "IfcContext"):
+        if each != projects[0]:
+            model.remove(each)
 
 
 def _complete(path: Path, model: Any, products: list) -> None:
