@@ -32,6 +32,8 @@ _BORDER, _BORDERED = 3, 0.003  # brightest of a border's 256 levels; share of th
 _FEW = 3  # photographs that may be black in the same places by chance
 _SCALED = 0.1
 """Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
+_ROUNDED = 2.0
+"""Pixels of a side, of the smaller of photograph and camera, that rounding both to whole ones explains."""
 _OTHERS = (".exr", ".hdr", ".jxl", ".jxr")
 """Suffixes of formats that Pillow does not read."""
 _TURN_BACK = {
@@ -192,24 +194,28 @@ def is_turned(view: View, image: Image.Image, path: Path) -> bool:
 
 
 def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
-    """Tell the user of photographs that are about as large as their cameras, but not quite: nobody scales by 2 %.
+    """Tell the user of photographs that have about the size or the shape of their cameras, but not quite.
 
-    COLMAP's undistorted photographs have other sizes than the originals, often by less.
+    Nobody scales by 2 %, or one side by another factor. COLMAP's undistorted photographs have other sizes than the
+    originals, often by less, and other shapes.
     """
     other = []
     for view in views:
         with suppress(SceneError):  # of a missing or damaged one, which is raised where it is used
-            size = np.array(upright_size(view))
-            apart = np.abs(size - _calibrated_size(view))
-            if apart.max() > 1 and (apart < _SCALED * size).all():
+            size, calibrated = np.array(upright_size(view)), np.array(_calibrated_size(view))
+            apart = np.abs(size - calibrated)
+            nearly = apart.max() > 1 and (apart < _SCALED * size).all()
+            longer = int(calibrated.argmax())
+            scale = size[longer] / calibrated[longer]
+            if nearly or np.abs(size - scale * calibrated).max() > _ROUNDED * max(scale, 1):
                 other.append((view, size))
     if other:
         view, (width, height) = other[0]
         of = "{}x{}".format(*_calibrated_size(view))
         notice(
-            f"{len(other)} photographs of {scene} have nearly the size of their cameras, but not quite: {view.name} is "
-            f"{width}x{height} pixels, its camera {of}. They are scaled, which is wrong if these are undistorted "
-            "cameras with the original photographs, or the other way round: both must be of one set."
+            f"{len(other)} photographs of {scene} have nearly the size or shape of their cameras, but not quite: "
+            f"{view.name} is {width}x{height} pixels, its camera {of}. They are scaled, which is wrong if these are "
+            "undistorted cameras with the original photographs, or the other way round: both must be of one set."
         )
 
 

@@ -277,9 +277,15 @@ def test_null_in_a_camera_says_nothing(scene):
     torch.testing.assert_close(view.camera.K, before.camera.K)
 
 
-@pytest.mark.parametrize(("size", "told"), [((4082, 3033), True), ((4000, 3000), False), ((2000, 1500), False)])
-def test_photographs_of_nearly_their_cameras_size_are_told_of(scene, caplog, size, told):
-    """As the undistorted ones of COLMAP beside the cameras of the originals."""
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        *(((4082, 3033), True), ((8000, 5952), True), ((1000, 744), True)),
+        *(((4000, 3000), False), ((2000, 1500), False), ((1333, 1000), False), ((750, 562), False)),
+    ],
+)
+def test_photographs_of_nearly_their_cameras_size_or_shape_are_told_of(scene, caplog, size, told):
+    """As the undistorted ones of COLMAP, as they are or scaled down, beside the cameras of the originals."""
     path = scene / "transforms.json"
     meta = json.loads(path.read_text())
     frames = meta["frames"]
