@@ -254,7 +254,7 @@ def _tell_of_verdicts(verdicts: Verdicts, places: Path) -> None:
     """Print what photographs together say against the shell, whose places are drawn in a file."""
     from shellgs_method.occlusion import MANY, UNCLEAR
 
-    if verdicts.before.share > 0:
+    if round(verdicts.before.share, 3) > 0:  # a speck is no part of a building
         console.print(
             f"{verdicts.before.share:.1%} of the shell is contradicted by {MANY} or more photographs and at least "
             f"half of those that see it: look at {verdicts.views[verdicts.before.witness]}, and at {places}, red "

@@ -833,6 +833,18 @@ def test_verdicts_name_the_views_in_which_much_moved():
     assert verdicts.moved_in == ["c", "b"]
 
 
+@pytest.mark.parametrize(("share", "said"), [(0.0004, ""), (0.001, "0.1% of the shell is contradicted by")])
+def test_a_speck_that_photographs_contradict_is_not_told(capsys, share: float, said: str):
+    """It was told as 0.0% of the shell."""
+    none = Votes.of(np.zeros((1, 0), bool), np.zeros(0, np.int64))
+    zero = np.zeros(1)
+    verdicts = Verdicts(np.zeros((0, 3)), none.count, replace(none, share=share), none, zero[:0], ["a"], zero, zero)
+    casting._tell_of_verdicts(verdicts, Path("contradicted.ply"))
+    printed = capsys.readouterr().out
+    assert said in printed
+    assert bool(printed) == bool(said)
+
+
 def test_surfaces_are_measured_on_the_shell_and_in_front_of_it():
     """A wall with something 1 m in front of its right half, which the rendering lacks."""
     camera, size = camera_at(0.0), (HEIGHT, WIDTH, 1)
