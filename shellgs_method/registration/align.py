@@ -281,7 +281,11 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     if tags is not None:
         off = tags.apart(best.survey_from_scene)
-        said = "" if off < REACH else ": it agrees with none, so check that the building and --crs are the right ones"
+        elsewhere = (
+            ": it agrees with none, so check that the building and --crs are the right ones, and crop a shell of a whole "
+            "district to what photographs show"
+        )
+        said = elsewhere if off >= REACH else ""
         history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
