@@ -41,7 +41,7 @@ _SWEPT = 6  # EXIF's CustomRendered of a panorama, as Apple writes it
 _WIDE = 2.5  # times as long as the other side: more than of any camera
 _PLAIN = 4.0  # deviation of the colours of a column that shows nothing, as of a black border: sky and ground are apart
 _DARK, _SMALL = 24, 64  # levels of what lies around the circle of a fisheye lens; pixels of its image's side
-_COMPARED = 9  # photographs
+_COMPARED, _SECTORS = 9, 12  # photographs; parts of a circle
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,17 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         said: those whose metadata say so.
 
     Raises:
-        SceneError: some are two circles side by side, which a 360° camera records before it stitches them.
+        SceneError: some are two circles side by side, which a 360° camera records before it stitches them, or one.
     """
     sizes = {name: _size(folder / name) for name in names if name not in said}
+    for size, group in groupby(sorted(sizes, key=sizes.__getitem__), key=sizes.__getitem__):
+        alike = list(group)
+        if np.mean([_is_circle(folder / name) for name in _some(alike)]) > 0.5:
+            raise SceneError(
+                f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, such as {alike[0]}, are circles on black, of "
+                "a fisheye lens, which sees too much for a camera here: export them as perspective or, of a 360° "
+                "camera, as equirectangular. If they are not: --camera-type perspective"
+            )
     if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
         notice(
             f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, have one side {_WIDE:g} times as long "
@@ -160,7 +168,7 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     for size, group in groupby(twice, key=sizes.__getitem__):
         alike = list(group)
         what = f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, {alike[0]} for example,"
-        some = [folder / name for name in alike[:: -(-len(alike) // _COMPARED)]]
+        some = [folder / name for name in _some(alike)]
         if np.mean([_are_circles(photograph) for photograph in some]) > 0.5:
             raise SceneError(
                 f"{what} are two circles side by side, which a 360° camera records before it stitches them: export "
@@ -180,6 +188,10 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     return sorted(found)
 
 
+def _some(names: Sequence[str]) -> Sequence[str]:
+    return names[:: -(-len(names) // _COMPARED)]
+
+
 def _size(photograph: Path) -> tuple[int, int]:
     with Image.open(photograph) as image:
         return image.size
@@ -194,6 +206,23 @@ def _are_circles(photograph: Path) -> bool:
     around, within = radius > 1.15, (np.abs(x) < 0.4) & (radius > 0.6) & (radius < 0.9)  # above and below the middle
     halves = small[:, :_SMALL], small[:, _SMALL:]
     return all(np.quantile(half[around], 0.95) < _DARK and half[within].mean() > 2 * _DARK for half in halves)
+
+
+def _is_circle(photograph: Path) -> bool:
+    """Whether an image is a circle on black, as high as the image: that of a fisheye lens of 180° or so.
+
+    All around within its edge there is something, as there is not of an object on black, and nothing beyond it.
+    """
+    with Image.open(photograph) as image:
+        side = min(image.size)
+        left, top = (image.width - side) // 2, (image.height - side) // 2
+        middle = image.convert("L").crop((left, top, left + side, top + side))
+        small = np.asarray(middle.resize((_SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+    y, x = np.mgrid[-1 : 1 : _SMALL * 1j, -1 : 1 : _SMALL * 1j]
+    radius, sector = np.hypot(x, y), np.floor((np.arctan2(y, x) / np.pi + 1) * _SECTORS / 2) % _SECTORS
+    within = (radius > 0.75) & (radius < 0.93)
+    around = [small[within & (sector == number)].mean() > 2 * _DARK for number in range(_SECTORS)]
+    return bool(np.quantile(small[radius > 1.15], 0.95) < _DARK and np.mean(around) > 0.8)
 
 
 def _seam(photograph: Path) -> float:

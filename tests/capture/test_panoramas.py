@@ -178,6 +178,25 @@ def test_two_circles_side_by_side_are_refused(tmp_path):
         find_panoramas(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], [])
 
 
+@pytest.mark.parametrize("width", [128, 192])
+def test_circles_of_a_fisheye_lens_are_refused(tmp_path, width: int):
+    """They were captured as perspective: of 24 all were registered, with twice the focal length."""
+    for k in range(3):
+        image = Image.new("RGB", (width, 128))
+        image.paste(circles(128, seed=k).crop((0, 0, 128, 128)), ((width - 128) // 2, 0))
+        image.save(tmp_path / f"{k}.jpg", quality=85)
+    with pytest.raises(SceneError, match=rf"3 photographs of {width}x128 pixels, such as 0.jpg, are circles on black"):
+        find_panoramas(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], [])
+
+
+def test_an_object_on_black_and_dark_corners_are_no_circles(tmp_path):
+    y, x = np.mgrid[-1:1:128j, -1:1:128j]
+    for name, light in (("object", np.abs(x) < 0.4), ("corners", 1 / (1 + np.hypot(x, y) ** 2))):
+        lit = np.asarray(photograph(128, 128)) * light[..., None]
+        Image.fromarray(lit.astype(np.uint8)).save(tmp_path / f"{name}.png")
+    assert find_panoramas(tmp_path, ["corners.png", "object.png"], []) == []
+
+
 def test_a_picture_between_black_borders_does_not_go_around(tmp_path, caplog):
     bordered = Image.new("RGB", (256, 128))
     bordered.paste(photograph(200, 128), (28, 0))
