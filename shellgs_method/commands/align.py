@@ -38,7 +38,7 @@ def align(
     bundle_adjust: bool = False,
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    metres_per_shell_unit: Length = 1.0,
+    metres_per_shell_unit: Optional[Length] = None,
     same_frame: bool = False,
     crs: Optional[str] = None,
     mesher: Optional[Mesher] = None,
@@ -131,7 +131,7 @@ class _Start:
     same_frame: bool
     accept: bool
     global_shift: tuple[float, float, float]
-    metres_per_shell_unit: float
+    metres_per_shell_unit: float | None
     crs: str | None
     mesher: Mesher | None
     spacing: float | None
@@ -150,7 +150,7 @@ class _Start:
             )
         if any(self.global_shift) and self.matrix is None:
             raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
-        if self.metres_per_shell_unit != 1 and not self.shell:
+        if self.metres_per_shell_unit is not None and not self.shell:
             raise SceneError(
                 "--metres-per-shell-unit belongs to a shell: give the shell again, and its start if it had one"
             )

@@ -41,7 +41,7 @@ def cast(
     shell: Files = None,
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    metres_per_shell_unit: Length = 1.0,
+    metres_per_shell_unit: Optional[Length] = None,
     crs: Optional[str] = None,
     truth: Files = None,
     max_image_size: Optional[FromOne] = None,
@@ -94,7 +94,7 @@ def cast(
         raise SceneError("the ground truth is cast after the shell: give --shell or --truth")
     if (matrix and not files) or (shell and not matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
-    if matrix is None and (any(global_shift) or metres_per_shell_unit != 1 or crs):
+    if matrix is None and (any(global_shift) or metres_per_shell_unit is not None or crs):
         raise SceneError("--global-shift, --metres-per-shell-unit and --crs go with --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
@@ -205,7 +205,9 @@ def _cast_truth(
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: grey has no ground truth.")
 
 
-def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], unit: float, crs: str | None) -> str:
+def _words(
+    truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], unit: float | None, crs: str | None
+) -> str:
     """The words of a command that casts the truth again."""
     words = ["--truth", *(path.resolve() for path in truth)]
     words += ["--matrix", matrix.resolve()] if matrix else []

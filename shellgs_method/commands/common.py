@@ -56,9 +56,9 @@ def launch(
     return partial(launch_locally, jobs=jobs, console=console)
 
 
-def shell_words(metres_per_shell_unit: float, crs: str | None) -> list[str]:
+def shell_words(metres_per_shell_unit: float | None, crs: str | None) -> list[str]:
     """Words of a further command on the same shell: its unit and system, as far as they were given."""
-    unit = ["--metres-per-shell-unit", str(metres_per_shell_unit)] if metres_per_shell_unit != 1 else []
+    unit = ["--metres-per-shell-unit", str(metres_per_shell_unit)] if metres_per_shell_unit is not None else []
     return unit + (["--crs", crs] if crs else [])
 
 

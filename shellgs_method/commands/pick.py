@@ -19,7 +19,7 @@ def pick(
     scene: Scene,
     shell: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="SHELL [SHELL ...]")],
     picks: Path = Path("picks.txt"),
-    metres_per_shell_unit: Length = 1.0,
+    metres_per_shell_unit: Optional[Length] = None,
     crs: Optional[str] = None,
     port: Port = 7070,
     open: bool = False,

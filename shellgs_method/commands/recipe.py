@@ -39,7 +39,7 @@ class Recipe:
     """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
     bundle_adjust: bool = False
     """Then adjust the cameras to the shell."""
-    metres_per_shell_unit: Length = 1.0
+    metres_per_shell_unit: Optional[Length] = None
     """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
     crs: Optional[str] = None
     """Coordinate reference system of the shell, such as EPSG:25832. If not set: as the shell's file says."""

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float64
 
 from shellgs_method.files.atomic import write_whole
+from shellgs_method.files.crs import in_metres
 from shellgs_method.geometry.axes import name_of, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of
@@ -84,7 +85,7 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, 
     offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
     to_shell = np.diag([1 / metres] * 3 + [1.0])
     to_shell[:3, 3] = offset / metres
-    crs = alignment.crs if metres == 1 else ""  # one in feet is not that of results in metres
+    crs = alignment.crs if in_metres(alignment.crs) else ""  # one in feet is not that of results in metres
     return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up, crs=crs)
 
 

@@ -65,6 +65,12 @@ def known_crs(text: str) -> CRS | None:
     return crs if is_named and len(crs.axis_info) > 1 else None  # not heights alone
 
 
+def in_metres(system: str) -> bool:
+    """Whether a system that PROJ knows counts metres; one that it does not know is not doubted."""
+    crs = known_crs(system)
+    return crs is None or all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in crs.axis_info)
+
+
 def name_of(crs: CRS) -> str:
     """The code of a system, such as EPSG:25832; its WKT if it has none."""
     authority = crs.to_authority()

@@ -177,26 +177,24 @@ def _of_las(header: LasHeader, path: Path) -> str:
     return crs.to_wkt()
 
 
-def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
+def metres_of(system: str, given: float | None, shell: Sequence[Path]) -> float:
     """Metres of a shell's unit: those given, or of the unit of its system where that is no metre, which is told.
 
     Args:
         system: name of the system; empty if unknown.
-        given: metres of the unit that the user gives, 1 if none.
+        given: metres of the unit that the user gives, if any.
         shell: its files; none where its unit is known already.
 
     Raises:
         SceneError: the system has heights in another unit than eastings, counts from the middle of the Earth, or is a
             projection of all of it; or a unit is given for a file that is read in metres.
     """
-    in_metres = [path for path in shell if path.suffix.lower() in IN_METRES]
-    if given != 1 and (converted := [*in_metres, *filter(_is_in_degrees, shell)]):
-        raise SceneError(f"{converted[0]} is read in metres, whatever its unit is: leave --metres-per-shell-unit out")
-    if in_metres:
-        return given
+    converted = [path for path in shell if path.suffix.lower() in IN_METRES]
+    if given not in (None, 1) and (read := [*converted, *filter(_is_in_degrees, shell)]):
+        raise SceneError(f"{read[0]} is read in metres, whatever its unit is: leave --metres-per-shell-unit out")
     crs = known_crs(system)
-    if crs is None or not shell:
-        return given
+    if converted or crs is None or not shell:
+        return given or 1.0
     if crs.is_geocentric:
         raise SceneError(
             f"{crs.name} is geocentric, and its axes are neither level nor vertical: convert the shell to a system "
@@ -211,8 +209,8 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
     if _differ(units.values()):
         raise SceneError(f"{crs.name} has axes in {' and in '.join(units)}: convert the shell to one unit")
     name, metres = next(iter(units.items()))
-    if given != 1 or abs(metres - 1) < 1e-9:
-        return given
+    if given is not None or abs(metres - 1) < 1e-9:
+        return given or 1.0
     notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken as {metres:.9g} m.")
     return metres
 

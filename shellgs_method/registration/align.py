@@ -72,13 +72,13 @@ def system_of(shell: Sequence[Path], given: str | None, scene: Path) -> str:
     return ""
 
 
-def system_and_unit(shell: Sequence[Path], crs: str | None, metres: float, scene: Path) -> tuple[str, float]:
+def system_and_unit(shell: Sequence[Path], crs: str | None, metres: float | None, scene: Path) -> tuple[str, float]:
     """The shell's coordinate reference system, by :func:`system_of`, and metres of its unit.
 
     Args:
         shell: its files; none if it is where it was before.
         crs: the system that the user gives.
-        metres: metres of the unit that the user gives, 1 if none.
+        metres: metres of the unit that the user gives, if any.
         scene: the scene's folder.
 
     Raises:
@@ -282,8 +282,8 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     if tags is not None:
         off = tags.apart(best.survey_from_scene)
         elsewhere = (
-            ": it agrees with none, so check that the building and --crs are the right ones, and crop a shell of a whole "
-            "district to what photographs show"
+            ": it agrees with none, so check that the building and --crs are the right ones, and crop a shell of a "
+            "whole district to what photographs show"
         )
         said = elsewhere if off >= REACH else ""
         history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")

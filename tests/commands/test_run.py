@@ -122,7 +122,7 @@ def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs,
     photographs, shell, matrix = inputs
 
     def align(scene, shell, matrix, metres_per_shell_unit, **settings):
-        doubted = {"verdict": "doubtful", "metrics": {LIKELIER: 0.3048}} if metres_per_shell_unit == 1 else {}
+        doubted = {"verdict": "doubtful", "metrics": {LIKELIER: 0.3048}} if metres_per_shell_unit is None else {}
         replace(scene_alignment(inputs), **{"verdict": "good", **doubted}).save(scene / ALIGNMENT)
 
     monkeypatch.setattr(run_command, "align", align)

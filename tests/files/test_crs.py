@@ -140,13 +140,13 @@ def test_a_system_is_known_by_its_code_and_no_word_is_taken_for_one(text, system
 
 def test_the_unit_of_a_system_is_that_of_its_shell_unless_another_is_given(caplog):
     scan, foot = (Path("scan.las"),), 1200 / 3937
-    assert metres_of("EPSG:2229", 1.0, scan) == pytest.approx(foot, rel=1e-12)
+    assert metres_of("EPSG:2229", None, scan) == pytest.approx(foot, rel=1e-12)
     assert "California zone 5 (ftUS), is in US survey foot: its unit is taken as 0.30480061 m" in caplog.text
-    assert metres_of("EPSG:2229", 0.001, scan) == 0.001
-    assert [metres_of(system, 1.0, scan) for system in ("", UTM, "EPSG:5555")] == [1, 1, 1]
-    assert metres_of("EPSG:2229", 1.0, (Path("a.ifc"),)) == 1  # is read in metres
+    assert [metres_of("EPSG:2229", given, scan) for given in (0.001, 1.0)] == [0.001, 1]
+    assert [metres_of(system, None, scan) for system in ("", UTM, "EPSG:5555")] == [1, 1, 1]
+    assert metres_of("EPSG:2229", None, (Path("a.ifc"),)) == 1  # is read in metres
     with pytest.raises(SceneError, match="axes in US survey foot and in metre: convert the shell to one unit"):
-        metres_of("EPSG:2229+5703", 1.0, scan)
+        metres_of("EPSG:2229+5703", None, scan)
 
 
 def test_a_unit_of_a_model_that_is_read_in_metres_is_refused():
@@ -157,8 +157,8 @@ def test_a_unit_of_a_model_that_is_read_in_metres_is_refused():
 @pytest.mark.parametrize("system", ["EPSG:3857", "ESRI:102100", "EPSG:3857+5773", "EPSG:3395"])
 def test_a_projection_of_the_whole_earth_has_no_unit_of_length(system):
     with pytest.raises(SceneError, match=r"stretched .* convert the shell to a system of its region"):
-        metres_of(system, 1.0, (Path("scan.las"),))
-    assert metres_of(system, 1.0, (Path("a.ifc"),)) == 1  # whose map conversion does not stretch
+        metres_of(system, None, (Path("scan.las"),))
+    assert metres_of(system, None, (Path("a.ifc"),)) == 1  # whose map conversion does not stretch
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_heights_of_a_scan_in_another_unit_are_refused(tmp_path, system, keys, d
     found = crs_of(tmp_path / "a.las")
     if differ:
         with pytest.raises(SceneError, match=r"axes in .* and in .*: convert the shell to one unit"):
-            metres_of(found, 1.0, (tmp_path / "a.las",))
+            metres_of(found, None, (tmp_path / "a.las",))
     else:
         assert found == f"EPSG:{system}"
 
@@ -231,7 +231,7 @@ def test_a_shell_that_is_not_in_the_area_of_its_system_is_not_said_to_be_in_it(c
 
 def test_a_system_from_the_middle_of_the_earth_is_refused():
     with pytest.raises(SceneError, match="is geocentric"):
-        metres_of("EPSG:4978", 1.0, (Path("scan.las"),))
+        metres_of("EPSG:4978", None, (Path("scan.las"),))
 
 
 def test_nothing_is_converted_to_a_local_system():
@@ -274,7 +274,7 @@ def test_conversions_that_are_metres_off_are_told(caplog, source, target, place,
 
 
 def test_polar_systems_have_lengths():
-    assert metres_of("EPSG:3031", 1.0, (Path("scan.las"),)) == 1
+    assert metres_of("EPSG:3031", None, (Path("scan.las"),)) == 1
 
 
 @pytest.mark.parametrize(

@@ -358,7 +358,7 @@ def test_a_citygml_in_degrees_is_read_in_metres(
 def test_a_unit_for_a_citygml_in_degrees_is_refused(tmp_path: Path):
     path = tmp_path / "a.gml"
     in_degrees(path, "EPSG:4937", [1, 0, 2], "EPSG:25832", (410_000, 5_413_000, 2))
-    assert metres_of("EPSG:25832", 1, [path]) == 1
+    assert metres_of("EPSG:25832", None, [path]) == 1
     with pytest.raises(SceneError, match=r"a.gml is read in metres, whatever its unit is: leave --metres-per-shell"):
         metres_of("EPSG:25832", 0.3048, [path])
 
