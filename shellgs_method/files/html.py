@@ -21,7 +21,7 @@ h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin-top: 2.5rem }
 small, figcaption { color: #59636e; font-size: .85rem }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 }
 th, td { text-align: left; padding: .3rem 1rem .3rem 0; border-bottom: 1px solid #d1d9e0; vertical-align: top }
-.numbers { overflow-x: auto } .numbers * + td, .numbers * + th { text-align: right; white-space: nowrap }
+.numbers { overflow-x: auto } .numbers tr { white-space: nowrap } .numbers * + td, .numbers * + th { text-align: right }
 pre { background: #f6f8fa; padding: .5rem; overflow-x: auto }
 figure { margin: 0 0 1rem } img { max-width: 100%; display: block }
 .row { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 20rem), 1fr)); gap: 1rem }
