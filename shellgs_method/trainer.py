@@ -38,7 +38,7 @@ from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint, un
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training
-from shellgs_method.runs.run_folder import check_method, check_world, guard_nerfstudio, written_config
+from shellgs_method.runs.run_folder import check_run, check_world, guard_nerfstudio, written_config
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
@@ -317,7 +317,7 @@ class FacadeTrainer(Trainer):
             _remove_leftovers(self.config.load_dir.parent)
         if path is None:
             return
-        check_method(path, self.config.method_name)
+        check_run(path, self.config)
         parsed = self.pipeline.datamanager.train_dataparser_outputs
         check_world(path.absolute().parents[1], parsed, "--data, or train again")
         state = load_checkpoint(path)

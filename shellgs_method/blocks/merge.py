@@ -15,7 +15,6 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig
-from shellgs_method.compare.settings import config_settings
 from shellgs_method.errors import SceneError, check_output_folder
 from shellgs_method.files.atomic import atomic_contents
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
@@ -33,6 +32,7 @@ from shellgs_method.runs.checkpoints import (
 )
 from shellgs_method.runs.coarse import CoarseRun, config_of
 from shellgs_method.runs.run_folder import open_run, written_config
+from shellgs_method.runs.settings import config_settings
 
 
 @dataclass(frozen=True)

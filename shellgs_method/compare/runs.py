@@ -15,13 +15,14 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.trainer import TrainerConfig
 
 from dataparsers.facade import read_views
-from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
+from shellgs_method.compare.settings import default_settings, parsed, scene_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.holdout import Half
 from shellgs_method.files.atomic import fingerprint, read_json, recover_folder, write_whole
 from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
 from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
+from shellgs_method.runs.settings import config_settings, difference
 from shellgs_method.shell import Alignment
 from shellgs_method.shell.cast import MASKS
 from shellgs_method.trainer import FacadeTrainerConfig
@@ -267,9 +268,7 @@ class Run:
                 and "checked maps" in self._cast_since
             ):
                 known["checked maps"] = "none"  # it was trained without them
-            changed = [key for key in settings if settings[key] != known[key]]
-            if changed:
-                what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])
+            if what := difference(known, settings):
                 raise OtherSettingsError(
                     f"{self.folder} is a run with other settings ({what}): give another --output, or remove that folder"
                 )
@@ -392,11 +391,6 @@ def _refuse_changed_photographs(layout: SceneLayout, method: str) -> None:
             f"{method} does not undistort or resize photographs, as the cameras of {scene} require: convert the scene "
             "to pinhole cameras at the size of its maps (colmap image_undistorter), or leave the method out"
         )
-
-
-def _short(value: object) -> str:
-    """A setting, shortened for a message."""
-    return str(value)[:12]
 
 
 def _words(*words: object) -> list[str]:

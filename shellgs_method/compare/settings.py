@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import io
-import re
-from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import fields, is_dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,13 +19,7 @@ from shellgs_method.files.atomic import content_hash, fingerprint
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.transforms import find_cloud
 from shellgs_method.occlusion import Displaced
-
-_IRRELEVANT = re.compile(
-    r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
-    r"|(load|steps_per|save_only)_\w+|(viewer|logging|machine)\..*|(pipeline\.datamanager\.(dataparser\.)?)?data"
-    r"|pipeline\.(datamanager\.train_cameras_sampling_seed|model\.coarse))"
-)
-"""Settings of a run's place, viewer, logs and checkpoints, and those that :class:`~.runs.Run` records by itself."""
+from shellgs_method.runs.settings import config_settings
 
 
 @cache
@@ -50,31 +41,9 @@ def parsed(words: tuple[str, ...]) -> TrainerConfig:
     return config
 
 
-def config_settings(config: TrainerConfig) -> dict[str, Any]:
-    """Settings of a config that a result depends on, by their paths, as JSON values."""
-    return {path: value for path, value in _flat(config) if not _IRRELEVANT.fullmatch(path)}
-
-
 def default_settings(method: str) -> dict[str, Any]:
     """:func:`config_settings` of a registered method."""
     return config_settings(all_methods[method])
-
-
-def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    if is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from _flat(getattr(value, field.name), f"{path}.{field.name}".lstrip("."))
-    elif isinstance(value, dict):
-        for key, each in value.items():
-            yield from _flat(each, f"{path}.{key}")
-    elif isinstance(value, (list, tuple)):
-        yield path, [each.value if isinstance(each, Enum) else each for each in value]
-    elif isinstance(value, (bool, int, float, str)) or value is None:
-        yield path, value
-    elif isinstance(value, Enum):
-        yield path, value.value
-    else:
-        yield path, getattr(value, "__qualname__", str(value))
 
 
 def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -25,8 +26,9 @@ from nerfstudio.pipelines.base_pipeline import Pipeline
 from wrapt import register_post_import_hook
 
 from dataparsers.cameras import scene_to_world
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.runs.config_file import load_config
+from shellgs_method.runs.settings import config_settings, difference
 
 READERS = {"nerfstudio.utils.eval_utils": "config_path", "nerfstudio.scripts.train": "config"}
 """Modules of nerfstudio that read a config.yml, and the variable that holds its path, or the config that names it."""
@@ -88,18 +90,27 @@ def written_config(config: TrainerConfig) -> str:
     return yaml.dump(named)
 
 
-def check_method(checkpoint: Path, method: str | None) -> None:
-    """Refuse the checkpoint of a run of another method, which the config.yml above it names.
+def check_run(checkpoint: Path, config: TrainerConfig) -> None:
+    """Refuse the checkpoint of a run of another method, and tell of one with other settings, by its config.yml.
 
     Raises:
         SceneError: names both methods; or that config.yml is damaged.
     """
     configs = [folder / "config.yml" for folder in checkpoint.absolute().parents[:3]]
     beside = next((path for path in configs if path.is_file()), None)
-    if beside is not None and (trained := load_config(beside).method_name) != method:
+    if beside is None:
+        return
+    trained, method = load_config(beside), config.method_name
+    if trained.method_name != method:
         raise SceneError(
-            f"{checkpoint} is a checkpoint of {trained}, not of {method}: resume it with `ns-train {trained}`, or "
-            f"leave it out and train {method} from the start"
+            f"{checkpoint} is a checkpoint of {trained.method_name}, not of {method}: resume it with "
+            f"`ns-train {trained.method_name}`, or leave it out and train {method} from the start"
+        )
+    if others := difference(config_settings(trained), config_settings(config)):
+        again = ["ns-train", str(method), "--load-config", str(beside), "--load-dir", str(checkpoint.parent)]
+        notice(
+            f"{checkpoint} was trained with other settings ({others}), and goes on with those of now: for its own, "
+            f"`{shlex.join(again)}`."
         )
 
 
