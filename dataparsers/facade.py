@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -286,7 +287,7 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     if known and (added := [frame.name for frame in recording.frames if frame.name not in known]):
         raise SceneError(
             f"{path} does not list {len(added)} of the scene's {len(recording.frames)} photographs, such as "
-            f"{added[0]}: run `shellgs blocks {config.data}` again"
+            f"{added[0]}: run `shellgs blocks {shlex.quote(str(config.data))}` again"
         )
     for split in ("train", "test"):
         of_split = _used(recording, split, config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Iterable
@@ -304,7 +305,7 @@ class FacadeTrainer(Trainer):
         done = f"{self.step + 1} of {self.config.max_num_iterations} iterations"
         if self.step >= self._start_step:
             self.save_checkpoint(self.step)
-            done += f": resume with --load-dir {self.checkpoint_dir}"
+            done += f": resume with --load-dir {shlex.quote(str(self.checkpoint_dir))}"
         writer.write_out_storage()
         CONSOLE.print(f"Stopped after {done}.", soft_wrap=True, highlight=False, markup=False)
         sys.exit(INTERRUPTED)
@@ -354,7 +355,7 @@ class FacadeTrainer(Trainer):
                 (saved,) = Path(partial).iterdir()
                 os.replace(saved, folder / saved.name)
         except (OSError, RuntimeError) as error:
-            remedy = f"resume with --load-dir {folder} if it has one"
+            remedy = f"resume with --load-dir {shlex.quote(str(folder))} if it has one"
             raise unwritten(f"the checkpoint of step {step}", self.base_dir, error, remedy) from error
         finally:
             self.checkpoint_dir = folder

@@ -110,8 +110,9 @@ class Recipe:
                 raise FileNotFoundError(f"{path} does not exist{later or ''}")
         scene = self.sources[0]
         if any(cameras.exists() for cameras in cameras_of(scene)):
+            named = shlex.quote(str(scene))
             raise SceneError(
-                f"{scene} is a scene with cameras: give its photographs, {scene / 'images'}, and --scene {scene}"
+                f"{scene} is a scene with cameras: give its photographs, {scene / 'images'}, and --scene {named}"
             )
         if len(self.starts) > 1:
             raise SceneError(f"the alignment starts from one of {', '.join(map(_flag, self.starts))}")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -169,7 +170,7 @@ class Blocks:
         if changed := self.cameras.changed(frames):
             raise SceneError(
                 f"{path}: the cameras of the scene have changed since it was cut: {changed}; cut it again with "
-                f"`shellgs blocks {path.parent} --again`"
+                f"`shellgs blocks {shlex.quote(str(path.parent))} --again`"
             )
 
     def write(self, path: Path) -> None:
@@ -196,7 +197,7 @@ class Blocks:
             SceneError: it is not there, damaged, names two blocks alike, or its cuts were moved.
         """
         if not path.is_file():
-            raise SceneError(f"{path} is not there: run `shellgs blocks {path.parent}` first")
+            raise SceneError(f"{path} is not there: run `shellgs blocks {shlex.quote(str(path.parent))}` first")
         contents = read_json(path)
         try:
             tree = _node(_item(contents, "tree", "it"), "tree")
@@ -211,7 +212,7 @@ class Blocks:
         if not moved and contents.get("photographs_of") != blocks.cuts:
             raise SceneError(
                 f"{path} was edited: its cuts or its overlap are not those that its photographs were found with; run "
-                f"`shellgs blocks {path.parent}` again"
+                f"`shellgs blocks {shlex.quote(str(path.parent))}` again"
             )
         return blocks
 

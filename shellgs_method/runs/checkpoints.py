@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -61,9 +62,10 @@ def finished_checkpoint(config: TrainerConfig, path: Path, called: str) -> Path:
     """
     checkpoint = find_checkpoint(config.get_checkpoint_dir())
     if (done := 1 + int(checkpoint.stem.removeprefix("step-"))) < config.max_num_iterations:
+        words = ["ns-train", str(config.method_name), "--load-config", str(path), "--load-dir", str(checkpoint.parent)]
         raise SceneError(
-            f"{called} has {done} of its {config.max_num_iterations} iterations: train it to its end with `ns-train "
-            f"{config.method_name} --load-config {path} --load-dir {checkpoint.parent}`"
+            f"{called} has {done} of its {config.max_num_iterations} iterations: train it to its end with "
+            f"`{shlex.join(words)}`"
         )
     return checkpoint
 

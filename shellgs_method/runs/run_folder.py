@@ -109,7 +109,7 @@ def check_run(checkpoint: Path, config: TrainerConfig) -> None:
     if others := difference(config_settings(trained), config_settings(config)):
         again = ["ns-train", str(method), "--load-config", str(beside), "--load-dir", str(checkpoint.parent)]
         notice(
-            f"{checkpoint} was trained with other settings ({others}), and goes on with those of now: for its own, "
+            f"{checkpoint} was trained with other settings ({others}), and continues with the new ones: for its own, "
             f"`{shlex.join(again)}`."
         )
 
@@ -206,9 +206,10 @@ def _resume_from(config: TrainerConfig, given: TrainerConfig) -> None:
             setattr(config, name, getattr(given, name))
     folder = config.get_checkpoint_dir()
     if not (config.load_dir or config.load_checkpoint) and any(folder.glob("step-*.ckpt")):
+        scene = shlex.quote(str(config.pipeline.datamanager.data))
         raise SceneError(
-            f"{folder} has checkpoints, which training again would replace: resume with --load-dir {folder}, or "
-            f"start another run with `ns-train {config.method_name} --data {config.pipeline.datamanager.data}`"
+            f"{folder} has checkpoints, which training again would replace: resume with --load-dir "
+            f"{shlex.quote(str(folder))}, or start another run with `ns-train {config.method_name} --data {scene}`"
         )
 
 

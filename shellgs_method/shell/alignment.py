@@ -235,9 +235,8 @@ class Alignment:
             SceneError: the file is damaged or its matrix is not a similarity.
         """
         if not path.is_file():
-            raise FileNotFoundError(
-                f"{path} does not exist: align the shell with `shellgs align {path.parent.parent} SHELL …`"
-            )
+            scene = shlex.quote(str(path.parent.parent))
+            raise FileNotFoundError(f"{path} does not exist: align the shell with `shellgs align {scene} SHELL …`")
         try:
             fields = read_json(path)
             matrix, shells = np.array(fields["shell_to_scene"], dtype=np.float64), _strings(fields["shell"])

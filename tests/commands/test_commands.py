@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,8 +19,10 @@ from rich.console import Console
 from shellgs_method import cli
 from shellgs_method.cli import main
 from shellgs_method.commands.common import open_page, table
-from shellgs_method.errors import INTERRUPTED
+from shellgs_method.errors import INTERRUPTED, SceneError
+from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.machine import doctor
+from shellgs_method.shell import ALIGNMENT, Alignment
 
 DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
 
@@ -308,3 +311,13 @@ def test_help_says_that_files_are_required(shellgs, command):
     told = shellgs(command, "--help")
     assert "(default: )" not in told.split(" options ")[0]
     assert "(required)" in told
+
+
+@pytest.mark.parametrize(
+    ("read", "named", "command"),
+    [(Alignment.load, ALIGNMENT, "shellgs align {} SHELL …"), (Blocks.read, Path(BLOCKS), "shellgs blocks {}")],
+)
+def test_a_command_that_a_message_names_can_be_pasted(read, named, command, tmp_path):
+    scene = tmp_path / "my house"
+    with pytest.raises((SceneError, FileNotFoundError), match=re.escape(f"`{command.format(repr(str(scene)))}`")):
+        read(scene / named)
