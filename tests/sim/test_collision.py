@@ -56,10 +56,10 @@ def test_what_stands_before_the_shell_is_measured_apart():
     found = both_ways(collider, wall(-4, 4), shell, [CAMERA], before=0.3)
     name = "from the collision geometry"
     assert astuple(found[f"{name}, on the shell"]) == pytest.approx((0, 0, 1), abs=1e-5)
-    assert astuple(found[f"{name}, in front of the shell"]) == pytest.approx((0.5, 0.5, 0))
+    assert astuple(found[f"{name}, before the shell"]) == pytest.approx((0.5, 0.5, 0))
     assert found[name].within == pytest.approx(0.5, abs=0.02)
     assert "to the collision geometry, on the shell" in found
-    assert "to the collision geometry, in front of the shell" not in found
+    assert "to the collision geometry, before the shell" not in found
     assert both_ways(collider, shell, shell, [CAMERA], before=0.3).keys() == {name, "to the collision geometry"}
 
 

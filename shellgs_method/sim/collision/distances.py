@@ -64,7 +64,7 @@ def both_ways(
         if shell is not None and shell is not other:
             ahead = shell.signed_distance(points) > before
             found[f"{name}, on the shell"] = Distances.of(distance[~ahead])
-            found[f"{name}, in front of the shell"] = Distances.of(distance[ahead])
+            found[f"{name}, before the shell"] = Distances.of(distance[ahead])
     return {name: distances for name, distances in found.items() if distances is not None}
 
 
