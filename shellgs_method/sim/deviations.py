@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.evaluation.colours import deviation_colours
 from shellgs_method.files.atomic import write_whole
