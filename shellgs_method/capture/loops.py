@@ -26,6 +26,8 @@ less at their weakest cut, those 15 cm off and less 0.15 and more, of real photo
 AGREEING = 0.8
 """Share of a pair's matches that must lie where the coarse model has them: where windows repeat, a pair's matches may
 be of one window in part, and of the next in the rest, on the same epipolar lines."""
+_EXPLAINED = 0.005
+"""Largest distance of matches from epipolar lines, in focal lengths: about COLMAP's 4 pixels."""
 _SAMPLE = 200  # points of a view that are projected into all others
 _RATIO, _COSINE = 3.0, 0.75  # of distances and between directions, within which features match
 _LEAST_SHARE = 0.25  # of a view's points
@@ -122,6 +124,18 @@ def agree(first: View, second: View, points: np.ndarray, matches: np.ndarray) ->
     return len(together) > 0 and float((together < DRIFT).mean()) > AGREEING
 
 
+def explained(first: View, second: View, matches: np.ndarray) -> np.ndarray:
+    """Which matches (M, 2) of features lie on epipolar lines: cameras do not contradict them."""
+    turn = second.viewmat[:, :3] @ first.viewmat[:, :3].T
+    step = second.viewmat[:, 3] - turn @ first.viewmat[:, 3]
+    a, b = (
+        np.column_stack([view.features[which], np.ones(len(which))])
+        for view, which in zip((first, second), matches.T, strict=True)
+    )
+    lines = np.cross(step, a @ turn.T)
+    return np.abs((lines * b).sum(axis=1)) < _EXPLAINED * np.linalg.norm(lines[:, :2], axis=1)
+
+
 def astray(steps: Sequence[np.ndarray], first: np.ndarray, second: np.ndarray, width: int) -> bool:
     """Whether matches lie elsewhere, in the median, than where the steps between their photographs move them.
 
@@ -150,7 +164,7 @@ def weakest_cut(pairs: np.ndarray, confirmed: np.ndarray, matched: np.ndarray) -
     Args:
         pairs: numbers i < j (P, 2), along the walk, of pairs of neighbours.
         confirmed: (P,), matches of each pair whose features the model takes for one point.
-        matched: (P,), all matches of each pair.
+        matched: (P,), all matches of each pair that say something of the model.
 
     Returns:
         Share of the matches across the cut that the model confirms, and the photograph before it; where no cut has

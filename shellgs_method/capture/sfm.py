@@ -24,7 +24,7 @@ import numpy as np
 import pycolmap
 from database import copied
 from features import CALIBRATED, MIN_CALIBRATED, extract, has_rigs, rig_of, write_image
-from loops import CONFIRMED, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut
+from loops import CONFIRMED, agree, along_the_walk, astray, bridges, explained, loops, shared, weakest_cut
 from models import SEED, forget, join, read_models, registered, verified, views_of
 from zoom import zoomed
 
@@ -215,19 +215,25 @@ class _Weakest(NamedTuple):
 
 
 def _weakest(database: str, model: pycolmap.Reconstruction) -> _Weakest:
-    """Share of the matches of neighbours that a model confirms where it does least, and the names around that place."""
+    """Share of the matches of neighbours that a model confirms where it does least, and the names around that place.
+
+    Matches without a point that its cameras explain do not count: COLMAP makes no points of what only two photographs
+    see.
+    """
     images = sorted(registered(model), key=lambda image: along_the_walk(image.name))
     at = {image.image_id: k for k, image in enumerate(images)}
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
         for image in images
     }
-    rows = []
+    views, rows = views_of([model])[0], []
     with pycolmap.Database.open(database) as opened:
         for a, b, matches in verified(opened):
             if a in at and b in at and abs(at[a] - at[b]) <= _NEAR and len(matches):
                 of_a, of_b = points[a][matches[:, 0]], points[b][matches[:, 1]]
-                rows.append([*sorted((at[a], at[b])), ((of_a == of_b) & (of_a >= 0)).sum(), len(matches)])
+                known = (of_a >= 0) | (of_b >= 0)
+                known |= ~explained(views[images[at[a]].name], views[images[at[b]].name], matches)
+                rows.append([*sorted((at[a], at[b])), ((of_a == of_b) & (of_a >= 0)).sum(), known.sum()])
     table = np.array(rows, int).reshape(-1, 4)
     share, k = weakest_cut(table[:, :2], table[:, 2], table[:, 3])
     return _Weakest(share, [image.name for image in images[k : k + 2]])

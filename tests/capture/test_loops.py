@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from shellgs_method.capture.loops import (
     along_the_walk,
     astray,
     bridges,
+    explained,
     loops,
     shared,
     weakest_cut,
@@ -92,6 +94,14 @@ def test_a_pair_whose_matches_are_of_two_windows_is_not_believed(share: float, i
     for k in range(int(share * len(mixed))):
         mixed[k, 1] = index[tuple(points[mixed[k, 0]] + [BAY, 0, 0])]
     assert agree(first, second, points, mixed) == is_believed
+
+
+def test_matches_beside_epipolar_lines_are_not_explained_by_the_cameras():
+    points = wall()
+    first, second = facing(0, 8, points), facing(1, 8, points)
+    both = matches(first, second)
+    assert explained(first, second, both).all()
+    assert not explained(first, replace(second, features=second.features + np.array([0, 0.02])), both).any()
 
 
 def test_a_walk_is_weakest_where_its_model_takes_the_same_for_different_points():
