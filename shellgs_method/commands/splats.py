@@ -47,7 +47,7 @@ def splats(
     facts: dict[str, object] = {"background": background}
     where = place(frame)
     if output.suffix.lower() in Y_UP:
-        where += " Turned, so that y is up."
+        where += "" if frame.properties["up"] == "y" else " Turned, so that y is up."
         frame, motion = frame.turned(Y)
         gaussians = moved(gaussians, motion)
         facts["turned"] = motion[:3, :3].tolist()

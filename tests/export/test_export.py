@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,14 @@ def test_splats_in_the_shells_frame_look_the_same_from_the_same_place(trainer, t
     difference = (read - render(trainer)["rgb"]).abs()
     assert difference.mean() < 1e-3
     assert difference.quantile(0.999) < 0.02
+
+
+def test_splats_of_a_shell_whose_y_is_up_are_not_said_to_be_turned(pristine_scene, tmp_path, monkeypatch, capsys):
+    trainer = trained(pristine_scene, tmp_path, "photo_gs", degree=0)
+    frame = replace(TrainedRun(model_of(trainer), data_of(trainer)).frame, up=np.array([0.0, 1.0, 0.0]))
+    monkeypatch.setattr(TrainedRun, "frame", frame)
+    cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.glb")
+    assert "Turned" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("suffix", "read", "least"), [("glb", of_glb, 45), ("spz", unpacked, 38)])
