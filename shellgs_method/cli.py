@@ -6,9 +6,7 @@ import inspect
 import re
 import warnings
 from collections.abc import Callable
-from typing import Any
 
-import docstring_parser
 import tyro
 
 from shellgs_method.commands.align import align
@@ -58,21 +56,12 @@ def main() -> None:
         warnings.filterwarnings("ignore", category=category)
     for command in COMMANDS:
         command.__doc__ = inspect.unwrap(command).__doc__ = _paragraphs(command)
-    docstring_parser.parse_from_object = _parsed
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             {command.__name__: command for command in COMMANDS},
             prog="shellgs",
             description="Prepare scenes, compare methods, evaluate and export runs. `ns-train` trains the methods.",
         )
-
-
-def _parsed(settings: Any, parse: Callable = docstring_parser.parse_from_object) -> docstring_parser.Docstring:
-    """A class's docstrings, those of its fields in a line each: tyro would keep the breaks of their indented lines."""
-    found = parse(settings)
-    for field in found.params:
-        field.description = " ".join((field.description or "").split()) or None
-    return found
 
 
 def _paragraphs(command: Callable) -> str:

@@ -149,22 +149,14 @@ def test_what_no_demo_can_be_made_with_is_refused_before_slow_imports(tmp_path, 
     assert ended.stdout.split() == ["False"]
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("align", "whose first line names another one, such as"),
-        ("align", "that the shell was aligned to with --bundle-adjust, else the largest"),
-        ("capture", "fewer where the picture moves little"),
-    ],
-)
-def test_help_has_no_line_breaks_of_docstrings(command, words, monkeypatch, capsys):
+def test_help_has_no_line_breaks_of_docstrings(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "400")
-    monkeypatch.setattr("sys.argv", ["shellgs", command, "--help"])
+    monkeypatch.setattr("sys.argv", ["shellgs", "align", "--help"])
     with pytest.raises(SystemExit):
         main()
     said = capsys.readouterr().out
-    assert said.startswith(f"usage: shellgs {command} [-h]")
-    assert words in said
+    assert said.startswith("usage: shellgs align [-h]")
+    assert "whose first line names another one, such as" in said
 
 
 def test_ns_eval_writes_all_metrics(demo):
