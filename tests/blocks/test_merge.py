@@ -217,7 +217,7 @@ def test_gaussians_of_two_blocks_in_one_place_are_doubles_and_those_of_one_block
     [
         ("missing", "no run of east"),
         ("twice", "3 runs of 2 blocks"),
-        ("of the whole scene", "no run of a block"),
+        ("of the whole scene", "not a run of a block"),
         ("unfinished", "6 of its 99 iterations"),
         ("cut again", "has been cut again"),
         ("another coarse run", "another coarse run"),
