@@ -13,9 +13,10 @@ from nerfstudio.engine.trainer import TrainerConfig
 _IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
     r"|(load|steps_per|save_only)_\w+|(viewer|logging|machine)\..*|(pipeline\.datamanager\.(dataparser\.)?)?data"
-    r"|pipeline\.(datamanager\.train_cameras_sampling_seed|model\.coarse))"
+    r"|pipeline\.(datamanager\.(train_cameras_sampling_seed|cache_images)|model\.coarse))"
 )
-"""Settings of a run's place, length, viewer, logs and checkpoints, and which seed and coarse run it begins with."""
+"""Settings of a run's place, length, viewer, logs and checkpoints, where its photographs are kept (over 500, nerfstudio
+itself sets another place), and which seed and coarse run it begins with."""
 
 
 def config_settings(config: TrainerConfig) -> dict[str, Any]:
