@@ -158,7 +158,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         held_out.kinds = [kind for kind in held_out.cues if self._can_be_measured(kind)]
 
     def _tell_of_other_photographs(self) -> None:
-        """Tell if the photographs that maps were made from are not those of this run."""
+        """Report if the photographs that maps were made from are not those of this run."""
         checked, mono = map(self.train_dataset.sets.get, ("checked", "mono"))
         scene = self.config.dataparser
         assert isinstance(scene, FacadeDataParserConfig)
@@ -330,7 +330,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return view
 
     def _share_of_gpu(self) -> float:
-        """Bytes of the GPU that photographs and maps may take, which are told if they matter."""
+        """Bytes of the GPU that photographs and maps may take, which are reported if they matter."""
         free, needed = free_memory(torch.device(self.device)), self.train_dataset.nbytes(self.config.cache_images_type)
         room = MAX_GPU_SHARE * free
         if needed > min(room, MIN_REPORTED_BYTES):

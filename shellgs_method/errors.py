@@ -32,7 +32,7 @@ class SceneError(ValueError):
 
 @cache
 def notice(sentence: str) -> None:
-    """Tell the user, once in a process, what is done with an input that can be used: a command reads it repeatedly."""
+    """Report, once per process, what is done with a usable input, which a command may read repeatedly."""
     log.warning("%s", sentence)
 
 

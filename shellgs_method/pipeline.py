@@ -181,7 +181,7 @@ class FacadePipeline(VanillaPipeline):
             )
 
     def _tell_of_held_out(self, trained_on: Sequence[str]) -> None:
-        """Tell of photographs that are held out now, and were not before the checkpoint."""
+        """Report photographs that are held out now, and were not before the checkpoint."""
         data, trained = self.datamanager, {*map(stem, trained_on)}
         trained -= {stem(view.name) for view in data.train_dataset.views}
         if known := [view.name for view in data.eval_dataset.views if stem(view.name) in trained]:
@@ -226,7 +226,7 @@ class FacadePipeline(VanillaPipeline):
         """Keep the state until :meth:`restore_training`: planning the schedules, which comes later, would clear it.
 
         Raises:
-            SceneError: the run is trained, and the scene has other cameras now, or the block was cut anew.
+            SceneError: the run is trained, and the scene has other cameras now, or the block was cut again.
         """
         self._training_state = state
         trained_with, data = BoundCameras.from_json(state.get("cameras", {})), self.datamanager

@@ -202,7 +202,7 @@ class FacadeTrainer(Trainer):
     def train_iteration(self, step: int):
         """One step, skipped where its gradients are not finite. The last one ends the run.
 
-        That a step was skipped is told at most :data:`LOOK_EVERY` steps later.
+        A skipped step is reported at most :data:`LOOK_EVERY` steps later.
 
         Nerfstudio 1.1.5 counts the iterations of a resumed run anew, later versions may not: neither is relied on.
 
@@ -251,7 +251,7 @@ class FacadeTrainer(Trainer):
 
     @property
     def _last_good(self) -> str:
-        """How a run that must stop can go on."""
+        """How a run that must stop can continue."""
         if any(self.checkpoint_dir.glob("*.ckpt")):
             return f"the last good checkpoint is kept in {self.checkpoint_dir}: resume from it with --load-dir"
         return "no checkpoint was saved before"

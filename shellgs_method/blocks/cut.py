@@ -111,9 +111,9 @@ def cut(
     """Cut a scene into blocks of about a length.
 
     The scene is cut across its length until no part is longer than one and a half lengths (or has more than one and a
-    half times as many photographs). A cut is where least of the walls goes on in the same plane on its other side: at
-    steps and gaps between buildings. Where those of both sides of a street are not opposite, the sides are cut apart
-    first, in the middle of the street.
+    half times as many photographs). A cut is where the least of the walls continues in the same plane on its other
+    side: at steps and gaps between buildings. Where those of both sides of a street are not opposite, the sides are
+    cut apart first, in the middle of the street.
 
     Args:
         seen: what the photographs show.

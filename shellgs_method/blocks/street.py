@@ -63,7 +63,7 @@ class BlockJob(Run):
 
     @property
     def as_begun(self) -> BlockJob:
-        """The same run, as long as when it was begun: other blocks may have been cut anew since."""
+        """The same run, as long as when it was started: other blocks may have been cut again since."""
         before = recorded_settings(self.recorded) if self.begun else {}
         same = before.get("block") == self.region and before.get(_AVERAGE) == self.average_iterations
         return replace(self, iterations=before["iterations"]) if same else self
@@ -72,7 +72,7 @@ class BlockJob(Run):
         """Write the settings into the run's folder, and the coarse run's last checkpoint.
 
         Raises:
-            SceneError: the folder holds another run, or one of this block before it was cut anew.
+            SceneError: the folder holds another run, or one of this block before it was cut again.
         """
         name, plan = self.variant.name, self.scene / BLOCKS
         if self.region not in {cell.fingerprint for cell in Blocks.read(plan).cells}:

@@ -17,8 +17,8 @@ COARSE, FINE = 0.1, 0.03
 STEP = 0.05
 """Metres between the cuts that are compared."""
 REACH, CLOSE = 3.0, 1.0
-"""Metres on both sides of a cut within which a wall that is on both goes on: about a bay of windows, by which buildings
-are told from each other, and what is next to the cut, by which it is put between them."""
+"""Metres on both sides of a cut within which a wall that is on both continues: about a bay of windows, by which
+buildings are distinguished, and what is next to the cut, by which it is put between them."""
 ASIDE = 0.8
 """Metres that a cut is moved at most to be put between buildings: less than from an end to a window."""
 DEPTH, HEIGHT = (0.25, 0.15), 0.5
@@ -26,7 +26,7 @@ DEPTH, HEIGHT = (0.25, 0.15), 0.5
 THICK = 0.5
 """Metres on both sides of a cut within which a wall that faces it is split in its relief."""
 SPLIT = 0.05
-"""Metres of a wall that goes on, to which a square metre of one that is split is equal."""
+"""Metres of a wall that continues, to which a square metre of one that is split is equal."""
 LONGER = 0.5
 """What a cut may cost, in multiples of the usual cut, to be at an end of its range rather than in the middle."""
 STREET = 4.0
@@ -93,7 +93,7 @@ class Walls:
         return along, float(low), float(high)
 
     def end(self, along: Float64[np.ndarray, " 3"], around: float, within: float) -> Place:
-        """The place for a cut across a direction where least of the walls goes on behind it, best near the middle.
+        """Place for a cut across a direction where the least of the walls continues behind it, best near the middle.
 
         Args:
             along: horizontal unit vector.
@@ -112,9 +112,9 @@ class Walls:
     def _going_on(
         self, along: Float64[np.ndarray, " 3"], cuts: Float64[np.ndarray, " K"], within: float, depth: float
     ) -> Float64[np.ndarray, " K"]:
-        """Metres of wall, measured upwards, that go on behind each of equally spaced cuts.
+        """Metres of wall, measured upwards, that continue behind each of equally spaced cuts.
 
-        A wall goes on as far as there is as much of it on both sides in the same place, seen along the direction. One
+        A wall continues as far as there is as much of it on both sides in the same place, seen along the direction. One
         that faces the cut costs too, if the cut splits its relief.
 
         Args:

@@ -47,7 +47,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright, with square
     pixels and without black borders, as JPEG.
 
-    Files are numbered by their frames in the video. Of several videos in a file, the largest is used, and told.
+    Files are numbered by their frames in the video. Of several videos in a file, the largest is used and reported.
 
     Raises:
         SceneError: the file cannot be read as a video, or holds no frame.
@@ -228,7 +228,7 @@ def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStr
 
 
 def _frames(container: av.container.InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Frames of a video, without packets that are damaged, as players show it; their share is told."""
+    """Frames of a video, without damaged packets, as players show it; their share is reported."""
     packets = damaged = 0
     for packet in container.demux(stream):
         packets += 1
@@ -244,7 +244,7 @@ def _frames(container: av.container.InputContainer, stream: VideoStream) -> Iter
 
 
 def _tell_of_a_cut(video: Path, stream: VideoStream, end: float) -> None:
-    """Tell the user of a video that ends before the time that its header says, of formats that say it."""
+    """Report a video that ends before the time in its header, for formats that have one."""
     start, whole = (float((each or 0) * (stream.time_base or 0)) for each in (stream.start_time, stream.duration))
     seconds = end - start
     if stream.container.format.name.startswith(_TIMED) and seconds < _WHOLE * whole:

@@ -70,7 +70,7 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
 
 
 def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:
-    """Tell the user which photographs share a camera only because nothing says that they do not."""
+    """Report photographs that share a camera only because nothing says that they do not."""
     unknown = []
     for name in names:
         with Image.open(folder / name) as image:

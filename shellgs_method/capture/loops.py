@@ -1,4 +1,4 @@
-"""Where a walk meets itself again, by a coarse model of its cameras: pairs worth matching, and matches to believe.
+"""Where a walk meets itself again, by a coarse model of its cameras: pairs worth matching, and matches to accept.
 
 Identical windows match as well as the same window does, and no geometry of two views tells them apart. The coarse
 model, from neighbours alone, does: it drifts by centimetres, and a bay is metres. Only numpy is imported, because
@@ -159,7 +159,7 @@ def bridges(groups: list[list[str]], count: int) -> list[tuple[str, str]]:
 
 
 def weakest_cut(pairs: np.ndarray, confirmed: np.ndarray, matched: np.ndarray) -> tuple[float, int]:
-    """Where a walk's photographs and its model agree least: a part that is metres off is torn from the rest there.
+    """Where a walk's photographs and its model agree least: a part that is off by metres is torn from the rest there.
 
     Args:
         pairs: numbers i < j (P, 2), along the walk, of pairs of neighbours.

@@ -138,7 +138,7 @@ def video_says_panorama(video: Path) -> bool:
 
 
 def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) -> list[str]:
-    """Names of the photographs in a folder that are panoramas: by metadata, or else by their pixels, which is told.
+    """Names of the photographs in a folder that are panoramas: by metadata, or else by their pixels, which is reported.
 
     Args:
         folder: photographs.

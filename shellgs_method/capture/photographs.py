@@ -86,7 +86,8 @@ def _png_with_exif(content: bytes, exif: bytes) -> bytes:
 def masks_as_stored(photographs: Mapping[str, Path], masks: Mapping[str, Path]) -> bool:
     """Whether masks are of the pixels that are stored, and to be turned with them, not of what photographs show.
 
-    Sizes tell, of photographs on their side. The others are taken to be likewise; that nothing tells is told.
+    The sizes of photographs stored on their side show it. Others are assumed to be the same; if there are none, this is
+    reported.
 
     Raises:
         SceneError: a mask is not a readable image.
@@ -121,7 +122,7 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path, as
         source: the original photograph, possibly with an EXIF orientation.
         photograph: the upright photograph in the work folder.
         target: png to write.
-        as_stored: whether a mask whose size does not tell is of the stored photograph.
+        as_stored: whether a mask whose size does not show it is of the stored photograph.
 
     Raises:
         SceneError: the mask is not a readable image, or has another size.

@@ -41,7 +41,7 @@ def folders(names: Sequence[str]) -> list[str]:
 
 
 def tell_of_a_rig(names: Sequence[str]) -> None:
-    """Tell the user that photographs are named as those of a rig, which may be chance."""
+    """Report that photographs are named like those of a rig, which may be chance."""
     prefixes = _prefixes(names)
     shots = taken_at_once(names, prefixes)
     if len(prefixes) > 1 and len(shots) >= LEAST_SHOTS and all(len(shot) == len(prefixes) for shot in shots.values()):

@@ -38,7 +38,7 @@ _SAME = 0.3  # pixels by which pictures may seem moved that show the same: those
 
 
 def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]:
-    """The photographs in a folder and its sub-folders, by their names in the scene; other files and copies are told.
+    """The photographs in a folder and its sub-folders, by their names in the scene; reports other files and copies.
 
     Args:
         folder: the folder.
@@ -66,7 +66,7 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
 
 
 def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
-    """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
+    """Report how many files of a folder are not photographs; refuse folders that should have some."""
     files = [
         path
         for path in sorted(files_below(folder))
@@ -88,7 +88,7 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
 
 
 def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
-    """Photographs without those that are copies of another's file, which is told, as are two formats of one name.
+    """Photographs without copies of another's file; these are reported, and so are two formats of one name.
 
     A view would be trained on whose copy is held out.
     """
@@ -132,7 +132,7 @@ def _smaller_copies(photographs: Sequence[Path]) -> dict[Path, Path]:
 
 
 def _size(photograph: Path) -> tuple[int, int]:
-    """Width and height as a photograph is shown; 0 where it cannot be read, which is told where it is."""
+    """Width and height as a photograph is shown; 0 if it cannot be read, which is reported when it is used."""
     with suppress(Exception), Image.open(photograph) as image:
         return image.size[::-1] if orientation_of(image) > 4 else image.size
     return 0, 0
@@ -146,7 +146,7 @@ def _small(photograph: Path) -> Float32[np.ndarray, "H W"]:
 
 
 def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
-    """Tell the user of photographs of one moment, as of one and what an editor made of it (IMG_0001, IMG_E0001)."""
+    """Report photographs of the same moment, such as one and its edited version (IMG_0001, IMG_E0001)."""
     moments: dict[tuple, list[Path]] = {}
     for path in photographs:
         with suppress(Exception), Image.open(path) as image:
@@ -173,7 +173,7 @@ def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, 
 
 
 def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
-    """Tell the user of photographs that show the same as others, as those that a messenger encoded again."""
+    """Report photographs that show the same as others, such as those that a messenger encoded again."""
     small = np.stack([_small(folder / name) for name in names])
     copies = [
         (name, names[int(alike.argmax())])
@@ -188,7 +188,7 @@ def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
 
 
 def tell_of_another_order(folder: Path, names: Sequence[str], overlap: int) -> None:
-    """Tell the user of photographs that were taken in another order than that of their names, by EXIF.
+    """Report photographs that, according to EXIF, were taken in another order than that of their names.
 
     Args:
         folder: folder of the photographs.

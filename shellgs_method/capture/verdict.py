@@ -46,7 +46,7 @@ class Summary:
 
 
 def judged(found: dict[str, Any], source: Path, config: CaptureConfig, masks: Path | None) -> Summary:
-    """Summary of the largest model that was found, of which what makes it doubtful is told.
+    """Summary of the largest model that was found, with a report of what makes it doubtful.
 
     Args:
         found: ``models.json``.
@@ -73,7 +73,7 @@ class _Verdict:
         self.missing = sorted(set(found["photographs"]) - set(self.largest["names"]), key=along_the_walk)
 
     def refuse_little(self) -> None:
-        """Refuse a model of too few of the photographs, or of too few points; tell of photographs without parallax."""
+        """Refuse a model with too few of the photographs or too few points; report photographs without parallax."""
         names, models, registered = self.found["photographs"], self.found["models"], len(self.largest["names"])
         is_flat = self.found.get("flat_pairs", 0) > NO_PARALLAX
         points, seen_in = self.largest.get("points", 0), self.largest.get("track_length", 0.0)
@@ -111,7 +111,7 @@ class _Verdict:
             )
 
     def tell_of_doubts(self) -> None:
-        """Tell of a model that is torn, or whose focal length changes or is not that of its lens."""
+        """Report a model that is torn, or whose focal length changes or is not that of its lens."""
         if torn := self.largest.get("torn"):
             slower = "more --frames, or a slower walk, help" if self.source.is_file() else "more photographs there help"
             notice(
@@ -132,7 +132,7 @@ class _Verdict:
                 _tell_of_a_doubtful_lens(**lens)
 
     def tell_of_passes_apart(self) -> None:
-        """Tell of the other models, of passes that did not join the largest."""
+        """Report the other models: passes that could not be joined with the largest."""
         for model in self.found["models"][1:]:
             names = sorted(set(model["names"]) - set(self.largest["names"]), key=along_the_walk)
             if names and len(model["names"]) >= LEAST_REGISTERED:
@@ -156,7 +156,7 @@ class _Verdict:
 
 
 def _tell_of_a_doubtful_lens(names: list[str], focal: Sequence[float], exif: float | None) -> None:
-    """Tell of a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
+    """Report a lens that is not EXIF's, or whose pixels are not square, as they are of all cameras."""
     across, down = focal
     is_other = exif is not None and not 1 / _OFF_EXIF < (across + down) / 2 / exif < _OFF_EXIF
     if is_other or max(across, down) > _OFF_SQUARE * min(across, down):

@@ -66,8 +66,8 @@ def align(
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference
             system, else a metre.
-        same_frame: The shell is in the frame and unit of the cameras: both are of one project of Metashape, RealityScan
-            or OpenDroneMap.
+        same_frame: The shell is in the frame and unit of the cameras: both come from one project of Metashape,
+            RealityScan or OpenDroneMap.
         crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
             another one, such as EPSG:4326 for degrees, are converted. If not set: as the shell's file says, or a .prj
             beside it, else that in which the same files were aligned before.

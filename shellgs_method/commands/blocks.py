@@ -40,7 +40,7 @@ def blocks(
     Args:
         scene: Scene folder with the shell's maps (`shellgs cast`), or else with SfM points that have tracks.
         length: Length of a block in metres.
-        photographs: Number of photographs of a block, in place of its length.
+        photographs: Number of photographs of a block, instead of its length.
         overlap: How far a block reaches beyond its cuts, in metres.
         again: Make new cuts.
         paths: Paths of the scene's files.

@@ -28,7 +28,7 @@ Files = Annotated[Optional[tuple[Path, ...]], tyro.conf.arg(metavar="PATH [PATH 
 SELDOM = 0.01
 """Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
 HOLES = 0.01
-"""Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
+"""Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is reported."""
 GLASS = 0.01
 """Share of the shell behind which photographs agree on something, above which it is hardly all panes of glass."""
 LITTLE, FAR_OFF = 0.2, 0.5

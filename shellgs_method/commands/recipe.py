@@ -34,7 +34,7 @@ class Recipe:
     positions: Optional[Path] = None
     """Text file of RTK camera positions, as `shellgs align` takes it."""
     same_frame: bool = False
-    """The shell is in the frame and unit of the cameras: both are of one project of photogrammetry."""
+    """The shell is in the frame and unit of the cameras: both come from one photogrammetry project."""
     refine: Optional[Length] = None
     """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
     bundle_adjust: bool = False

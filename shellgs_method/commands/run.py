@@ -1,4 +1,4 @@
-"""`shellgs run`: from a video and a scan to a mesh, in one command that goes on where it stopped."""
+"""`shellgs run`: from a video and a scan to a mesh, in one command that continues where it stopped."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def _is_there(alignment: Path, scene: Path) -> bool:
 
 
 def _train(recipe: Recipe, scene: Path, results: Path, done: Record) -> Run:
-    """Train and evaluate, unless that is done; an interrupted run goes on, one with other settings is put aside."""
+    """Train and evaluate, unless that is done; an interrupted run resumes, one with other settings is put aside."""
     import nerfstudio.configs.method_configs  # noqa: F401  (first: its import takes longer from deep in others)
 
     from shellgs_method.compare.results import compare

@@ -82,7 +82,7 @@ def splats(
 
 
 def _tell_of_others(output: Path, levels: int) -> None:
-    """Tell of files that are named as further levels: an earlier command's, or the user's, so they are kept."""
+    """Report files that have the names of further levels: an earlier command's, or the user's, so they are kept."""
     further = (output.with_stem(f"{output.stem}-{number}") for number in range(levels, MOST_LEVELS))
     if others := ", ".join(path.name for path in further if path.exists()):
         warn(f"Not of these levels, and left as before: {others}.")

@@ -40,7 +40,7 @@ def facing(normal: Float[np.ndarray, "H W 3"], camera: Camera) -> Float[np.ndarr
 def decoded(stored: Shaped[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     """Normals as vectors, which files may hold as colours, (n + 1) / 2: unsigned integers, or numbers up to 1 or 255.
 
-    Other numbers are told apart by their lengths: vectors are unit vectors, or else some are negative.
+    Other numbers are distinguished by their lengths: vectors are unit vectors, or else some are negative.
 
     Returns:
         Vectors of any length; zero where the file has none: where it is zero, NaN, black or grey.

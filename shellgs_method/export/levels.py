@@ -26,7 +26,7 @@ from shellgs_method.render.maps import DISC_LOG_THICKNESS
 NEIGHBOURS = 8
 """Nearest Gaussians that each may be merged with."""
 SHARE = 0.3
-"""Share of the pairs that is merged before neighbours and costs are found anew."""
+"""Share of the pairs that is merged before neighbours and costs are computed again."""
 COLOUR = 20.0
 """Cost of a unit of squared distance of colours, in that of a unit of the Kullback-Leibler divergence."""
 THICKNESS = 0.1

@@ -56,7 +56,7 @@ class BoundCameras:
     def changed(self, views: Sequence[View | Frame]) -> str | None:
         """How the cameras of photographs differ from these, in words; None if they agree.
 
-        Two photographs in common show that the frame is the same; one does not tell its scale.
+        Two photographs in common show that the frame is the same; one does not determine its scale.
         """
         shared = self._shared(views)
         if len(shared) < min(2, len(self.cameras), len(views)):

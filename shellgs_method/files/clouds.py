@@ -107,7 +107,7 @@ def merged(
 
 
 class Cloud:
-    """A point cloud in a file, whose points are read anew whenever they are iterated over.
+    """A point cloud in a file, whose points are read again at each iteration over them.
 
     Points at exactly 0 0 0, which scanners write where a ray hit nothing, are left out with a warning that counts them;
     one that is among the others is taken for a point of the surface.

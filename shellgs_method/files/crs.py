@@ -94,7 +94,7 @@ def given_crs(text: str) -> str:
 
 
 def crs_there(system: str, place: Float64[np.ndarray, " 3"], metres: float) -> str:
-    """A system, or "" where what is said to be in it is not in its area, which is told: a shell less an offset is not.
+    """A system, or "" if what is said to be in it is outside its area, as a shell minus an offset is; this is reported.
 
     Args:
         system: name of the system; empty if unknown.
@@ -192,7 +192,7 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
 
 
 def _tell_of_accuracy(operation: Transformer, what: str) -> None:
-    """Tell the user of a conversion that is metres off: PROJ has no grid for it here, or nobody knows better."""
+    """Report a conversion that may be off by metres: PROJ has no grid for it here, or none exists."""
     from pyproj.exceptions import ProjError
 
     with suppress(ProjError):  # it had no choice of operations

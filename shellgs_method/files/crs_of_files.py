@@ -155,7 +155,7 @@ def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:
 def _of_las(header: LasHeader, path: Path) -> str:
     """A scan's system, which laspy reads without heights; with them where they are in another unit.
 
-    That it has none but is in feet is told.
+    If it has none but is in feet, this is reported.
     """
     from pyproj.crs import CRS, CompoundCRS
 
@@ -178,7 +178,7 @@ def _of_las(header: LasHeader, path: Path) -> str:
 
 
 def metres_of(system: str, given: float | None, shell: Sequence[Path]) -> float:
-    """Metres of a shell's unit: those given, or of the unit of its system where that is no metre, which is told.
+    """Metres of a shell's unit: those given, or of its system's unit if that is not the metre, which is reported.
 
     Args:
         system: name of the system; empty if unknown.

@@ -1,4 +1,4 @@
-"""Tell which pixels a mask keeps: white ones and opaque ones, of 1, 8 or 16 bits; labels and colours are refused."""
+"""Which pixels a mask keeps: white ones and opaque ones, of 1, 8 or 16 bits; labels and colours are refused."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class NamedFiles:
         return self._find(name, where, [self.scene])
 
     def tell_what_is_elsewhere(self) -> None:
-        """Tell the user which files were found under other paths than those written."""
+        """Report which files were found under other paths than those written."""
         if self._elsewhere:
             name, found = next(iter(self._elsewhere.items()))
             name = name.encode(errors="backslashreplace").decode()

@@ -58,7 +58,7 @@ class View:
         camera: the undistorted camera of the photograph, in the scene's own frame and units.
         lens: the calibrated camera, if it has lens distortion.
         mask: the user's mask file (white is kept), if there is one.
-        turned: whether the camera is of the photograph turned by its EXIF orientation, though the shape does not tell.
+        turned: whether the camera is of the photograph turned by its EXIF orientation, if its shape cannot show it.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Shown:
 
 
 def some_small(views: Sequence[View]) -> list[Shown]:
-    """Some photographs that are spread over a scene, without damaged ones, which are told where they are used."""
+    """Some photographs that are spread over a scene, without damaged ones, which are reported when they are used."""
     shown = []
     for view in (views[k] for k in spread(len(views), _SOME)):
         small = replace(view, camera=view.camera.shrunk(_SMALL))
@@ -194,7 +194,7 @@ def is_turned(view: View, image: Image.Image, path: Path) -> bool:
 
 
 def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
-    """Tell the user of photographs that have about the size or the shape of their cameras, but not quite.
+    """Report photographs that have nearly the size or the shape of their cameras, but not quite.
 
     Nobody scales by 2 %, or one side by another factor. COLMAP's undistorted photographs have other sizes than the
     originals, often by less, and other shapes.
@@ -297,7 +297,7 @@ def read_mask(path: Path) -> Image.Image:
 
 
 def tell_of_borders(photographs: Sequence[Shown], scene: Path) -> None:
-    """Tell the user if photographs have the same borders in black.
+    """Report photographs that have the same black borders.
 
     Programs that undistort photographs leave corners where these show nothing, and editors letterboxes; a night's sky
     is nowhere black in all photographs.
@@ -337,7 +337,7 @@ def _exif_log_gain(path: Path) -> float:
 
 
 def without_hidden(image: Image.Image) -> Image.Image:
-    """The image, black where it is transparent: the colours that are stored there are nobody's."""
+    """The image, black where it is transparent: the colours stored there mean nothing."""
     return image.convert("RGBa").convert("RGBA") if image.mode == "RGBA" else image
 
 

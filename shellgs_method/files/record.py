@@ -1,4 +1,4 @@
-"""A record of what was made, and of what, so that work goes on where it stopped."""
+"""A record of what was made, and of what, so that work resumes where it stopped."""
 
 from __future__ import annotations
 

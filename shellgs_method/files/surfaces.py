@@ -67,7 +67,7 @@ SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 
 
 def usual_up(shells: Sequence[str]) -> Float64[np.ndarray, " 3"]:
-    """The direction upwards in a shell's files where cameras do not tell: y in glTF, by that format's rule, else z."""
+    """Up in a shell's files, if cameras do not determine it: y in glTF, by definition of that format, else z."""
     return np.eye(3)[1 if all(shell.lower().endswith((".glb", ".gltf")) for shell in shells) else 2]
 
 

@@ -265,7 +265,7 @@ def _lines_of(text: str) -> list[str]:
 
 
 def _comments_in(lines: Sequence[str], path: Path) -> list[str]:
-    """What lines say that begin with #; that some look like rows is told."""
+    """Contents of lines that begin with #; those that look like rows are reported."""
     numbered = (re.split(r"[\s,;]+", line) for line in lines if re.match(r"\s*#\w", line))
     if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
         notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")

@@ -76,7 +76,7 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
 
 
 def _tell_of_unread(sources: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Tell the user of what may be a part of the lens, under names that nerfstudio does not have, and is not 0."""
+    """Report what may describe the lens under names that nerfstudio does not know, and is not 0."""
     keys = {key for source in sources for key in source} - {*_LENS, *COEFFICIENTS, *OTHER_COEFFICIENTS, _LISTED}
     named = sorted(key for key in keys if _UNREAD.fullmatch(key.lower()))
     if unread := [key for key in named if any(re.search("[1-9]", str(source.get(key))) for source in sources)]:
@@ -87,7 +87,7 @@ def _tell_of_unread(sources: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _tell_of_metashape(lenses: Sequence[Lens], path: Path) -> None:
-    """Tell the user of p1 and p2 of Metashape, of which OpenCV's are the other way round, if pixels show it.
+    """Report p1 and p2 in Metashape's order, the reverse of OpenCV's, if pixels show it.
 
     As nerfstudio copies them (its issue 3714, in 1.1.5); nothing tells whether they have been exchanged since.
     """

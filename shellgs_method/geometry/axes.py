@@ -13,7 +13,7 @@ from shellgs_method.geometry.planes import across
 _ROLL, _PITCH = np.sin(np.radians(3)), np.sin(np.radians(30))
 """Sines of usual angles by which photographs are rolled, and by which cameras look up or down."""
 _ROLLED = np.sin(np.radians(20))
-"""Sine of the angle from which a photograph is rolled, and tells nothing, unless it is rolled by a right angle."""
+"""Sine of the angle from which a photograph is rolled, and does not count, unless it is rolled by a right angle."""
 _DOWN = 0.2
 """Cosine between up and an image's upper edge below which a camera looks straight down."""
 _PAIRS = 300
@@ -24,7 +24,7 @@ _MOST = 2000
 def upwards(
     cameras: Iterable[Camera], axes: Iterable[Float64[np.ndarray, " 3"]] = ()
 ) -> Float64[np.ndarray, " 3"] | None:
-    """Up in the world, a unit vector, by cameras; None if they do not tell.
+    """Up in the world, a unit vector, by cameras; None if they do not determine it.
 
     It is the direction that the horizontal axes of all images are normal to, wherever cameras look up or down; where
     these are all parallel, the one of those nearest to the images' own up. Some photographs may be rolled by any angle,

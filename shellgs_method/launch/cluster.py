@@ -205,7 +205,7 @@ class _Tasks:
 
 @contextmanager
 def _marked(runs: Sequence[Job], launch: str) -> Iterator[list[Path]]:
-    """Files in all folders of the runs, by which a node tells that it sees these; none if one cannot be written to."""
+    """Files in all folders of the runs, by which a node shows that it sees these; none if one cannot be written to."""
     marks = [folder / f".{launch}" for folder in {each for run in runs for each in (run.scene, run.output)}]
     try:
         try:

@@ -14,7 +14,7 @@ from shellgs_method.launch.pace import Pace
 from shellgs_method.machine.progress import ITERATION, Stage
 
 TICK = 1.0
-"""Seconds between two looks at what a log has not told yet."""
+"""Seconds between two looks at what a log does not have yet."""
 OFTEN, SELDOM = 10.0, 60.0
 """Seconds between two lines of a log about the same stage: in the first minutes, and at most."""
 GROWTH = 0.05
@@ -43,7 +43,7 @@ class Work:
         return f"{self.stage} ({_clock_time(now - self._start)}{estimate})"
 
     def for_log(self) -> str | None:
-        """What a log should tell now, if anything."""
+        """What a log should print now, if anything."""
         now = self._clock()
         counts = self.stage.item is not None  # else there is nothing new to tell
         interval = min(max(OFTEN, GROWTH * (now - self._start)), SELDOM) if counts else SELDOM

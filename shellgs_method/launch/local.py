@@ -59,7 +59,7 @@ def finish(
     Args:
         run: the run, settled.
         announce: called with each command when it starts.
-        tell: called with each stage that their output tells.
+        tell: called with each stage that their output names.
         device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 
     Raises:
@@ -99,7 +99,7 @@ def follow(
     Args:
         commands: lists of words.
         announce: called with each command when it starts.
-        tell: called with each stage that their output tells.
+        tell: called with each stage that their output names.
         log: file that the output is appended to.
         device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 

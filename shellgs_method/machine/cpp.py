@@ -51,7 +51,7 @@ def switched_on() -> bool:
 
 @functools.cache
 def load_library(source: str) -> ctypes.CDLL | None:
-    """Compile C++, unless that was done on this machine before, and load it; None, which is told, where that fails."""
+    """Compile C++, unless that was done on this machine before, and load it; None, and a report, if that fails."""
     try:
         if (compiler := system.compiler()) is None:
             raise FileNotFoundError("there is no C++ compiler (what CXX names, g++ or clang++)")

@@ -69,7 +69,7 @@ def _works(device: int) -> bool:
 
 @functools.cache
 def load_kernel(source: str, device: int) -> Kernel | None:
-    """Compile CUDA, unless that was done on this machine before, and load it; None, which is told, where that fails."""
+    """Compile CUDA, unless that was done on this machine before, and load it; None, and a report, if that fails."""
     try:
         arch = "sm_{}{}".format(*torch.cuda.get_device_capability(device))
         made_of = [source, arch, *_FLAGS, str(torch.version.cuda)]

@@ -32,7 +32,7 @@ class Stage(NamedTuple):
 
     @classmethod
     def read(cls, line: str) -> Stage | None:
-        """The stage that a line of output tells, if any: ``Reading the scene ...``, ``Evaluating view: 3 of 8``."""
+        """The stage that a line of output names, if any: ``Reading the scene ...``, ``Evaluating view: 3 of 8``."""
         if match := _NERFSTUDIO.match(line):
             return cls(ITERATION, int(match[1]) + 2)  # printed when that one, counted from 0, has ended
         if match := _LINE.fullmatch(line.rstrip()):

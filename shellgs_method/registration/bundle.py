@@ -301,7 +301,7 @@ def _held(system: _Linearised, bundle: Bundle, seen: Observations) -> np.ndarray
 def adjust(
     objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = _CONVERGED
 ) -> tuple[Bundle, float]:
-    """Minimise an objective from a start; return the minimum and the damping to go on with.
+    """Minimise an objective from a start; return the minimum and the damping to continue with.
 
     Along directions that nothing determines, such as the seven of the frame where only photographs speak, the bundle
     keeps its place: the gradient is 0 there, and damping holds it.

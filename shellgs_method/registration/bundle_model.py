@@ -21,7 +21,7 @@ _SHARED = 10  # photographs of a lens from which on its distortion is found
 
 
 def with_finite_points(model: Model) -> Model:
-    """The model with points in the midst of the others where they are NaN or infinite: they are triangulated anew."""
+    """The model with points in the midst of the others where they are NaN or infinite: they are triangulated again."""
     positions = model.points.positions
     finite = np.isfinite(positions).all(axis=1)
     amidst = np.median(positions[finite], axis=0) if finite.any() else np.zeros(3)

@@ -82,7 +82,7 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
     """Read a file of picks, in the coordinate reference system that its header names, or else the shell's, ``crs``.
 
     Lines of photographs that are not in the scene are left out, as in a list of several flights, and with them points
-    of which too little is left; the user is told of both.
+    of which too little is left; both are reported.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -205,7 +205,7 @@ def _peaks(score: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How candidates are measured, refined and told from each other.
+    """How candidates are measured, refined and distinguished.
 
     Attributes:
         surface: the shell.

@@ -111,7 +111,7 @@ class _Sight:
     cameras: Sequence[Camera]
     photographs: Sequence[tuple[Camera, UInt8[np.ndarray, "H W 3"]]]
     observed: Sequence[Int[np.ndarray, " M"]] | None = None
-    """Indices of the points that each camera observes, where tracks tell."""
+    """Indices of the points that each camera observes, where tracks are known."""
     features: Sequence[Float64[np.ndarray, "M 2"]] = (np.empty((0, 2)),)
     """Where they do, in shares of the photograph's sides; NaN where that is unknown."""
     lenses: Sequence[Lens | None] = ()
@@ -156,7 +156,7 @@ class _Sight:
     def drift(self, points: np.ndarray) -> float:
         """How far points are from where the photographs show them, in the median, in shares of the sides of these.
 
-        0 where too few tracks tell.
+        0 where too few tracks are known.
         """
         missed = np.linalg.norm(self._projected(points) - np.concatenate(self.features), axis=1)
         known = missed[~np.isnan(missed)]

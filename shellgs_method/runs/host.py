@@ -2,7 +2,7 @@
 
 They are not ours to change, and with these methods end in a traceback, or write something else than what was asked
 for. Where a model, a data manager or a config is asked for what it has not, it refuses by :func:`refuse`; the rest is
-mended in the modules of the commands, in processes that run one of them.
+patched in the modules of the commands, in processes that run one of them.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class NoPixelSampler:
 
 
 def mend_commands() -> None:
-    """Mend the command of nerfstudio that this process runs, if any."""
+    """Patch the command of nerfstudio that this process runs, if any."""
     for module, mend in _MENDS.items():
         if module in sys.modules:
             mend(sys.modules[module])

@@ -91,7 +91,7 @@ def written_config(config: TrainerConfig) -> str:
 
 
 def check_run(checkpoint: Path, config: TrainerConfig) -> None:
-    """Refuse the checkpoint of a run of another method, and tell of one with other settings, by its config.yml.
+    """Refuse the checkpoint of a run of another method, and report one with other settings, by its config.yml.
 
     Raises:
         SceneError: names both methods; or that config.yml is damaged.
@@ -196,7 +196,7 @@ class _RunReader:
 
 
 def _resume_from(config: TrainerConfig, given: TrainerConfig) -> None:
-    """Take over which checkpoint to resume from, or a run would be trained anew over the one that was named.
+    """Take over which checkpoint to resume from, or a run would be trained again over the one that was named.
 
     Raises:
         SceneError: none is named, and the run has some.

@@ -244,7 +244,7 @@ def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
 
 
 def _tell_of_strays(scene: Path, views: Sequence[View]) -> None:
-    """Tell the user of masks painted for the shell that are not called as :func:`_load_masks` looks for them."""
+    """Report masks painted for the shell that do not have the names that :func:`_load_masks` looks for."""
     painted, used = photographs_in(scene / MASKS, deep=True), {scene / MASKS / f"{view.name}.png" for view in views}
     if strays := [path for path in painted if path not in used]:
         name = views[0].name

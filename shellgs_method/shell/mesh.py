@@ -129,7 +129,7 @@ def joined(meshes: Sequence[ShellMesh], paths: Sequence[Path], metres_per_unit: 
 
 
 def _check_frame(boxes: Sequence[Float64[np.ndarray, "2 3"]], paths: Sequence[Path], metres_per_unit: float) -> None:
-    """Refuse a file that is kilometres from the others; tell of one that stands alone or is of another size."""
+    """Refuse a file that is kilometres from the others; report one that stands alone or has another size."""
     low, high = np.stack(boxes, axis=1)
     sizes = np.linalg.norm(high - low, axis=1)
     gaps = np.linalg.norm(np.maximum(low[:, None] - high, 0) + np.maximum(low - high[:, None], 0), axis=2)

@@ -134,7 +134,7 @@ def as_seen(cloud: Cloud, sights: Sights | None, spacing: float | None, metres_p
     """The points of a cloud, merged as finely as cameras resolve, if that is finer than those of its first reading.
 
     All of them, if they fit into :data:`MOST` voxels, else those that cameras see. Where even these do not fit, the
-    voxels are larger, and the user is told.
+    voxels are larger, which is reported.
 
     Args:
         cloud: the cloud.

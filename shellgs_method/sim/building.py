@@ -145,7 +145,7 @@ class Reconstruction:
 
     @cached_property
     def ground(self) -> Ground:
-        """The ground before the building; level if its height is given."""
+        """The ground in front of the building; level if its height is given."""
         return Ground.of(self.ground_points, self.eyes)
 
     @property
@@ -189,7 +189,7 @@ class Reconstruction:
         return np.where(near, self.classes[closest.triangle], np.uint8(SurfaceClass.OTHER))
 
     def warn_if_unaligned(self, log: Callable[[str], None]) -> None:
-        """Tell the user what is different without an aligned shell."""
+        """Report what is different without an aligned shell."""
         if self.shell is None:
             log(
                 f"{self.scene} has no aligned shell: the frame is the scene's, rotated upright by the cameras' up "

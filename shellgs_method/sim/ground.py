@@ -1,4 +1,4 @@
-"""The ground in front of a building: a height field, which goes on to a plane where nothing near is known."""
+"""The ground in front of a building: a height field, which continues as a plane where nothing near is known."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Ground:
         heights: in metres; rows along y, columns along x.
         cell: distance between rows and between columns, in metres.
         origin: x and y of the first row and column.
-        known: where the heights are measured; elsewhere they go on as beside, and far away as a plane.
+        known: where the heights are measured; elsewhere they continue their surroundings, and far away a plane.
     """
 
     heights: Float64[np.ndarray, "R C"]

@@ -13,7 +13,7 @@ class SimSettings:
     """Settings of a simulation folder."""
 
     parts: Annotated[float, Bounds(TINY, 1e6)] = 200
-    """Maximum number of convex collision parts for 100 square metres of surface."""
+    """Maximum number of convex collision parts per 100 square metres of surface."""
     faces: Annotated[int, Bounds(4, 1e9, int)] = 50_000
     """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[Length] = None
@@ -26,7 +26,7 @@ class SimSettings:
     ground: Optional[Annotated[float, Bounds(-1e6, 1e6)]] = None
     """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
     name: str = "facade"
-    """Name of the building in the files, as of ROS' package. Of several buildings, each has its scene's."""
+    """Name of the building in the files, also of the ROS package. Several buildings are named like their scenes."""
     test: bool = False
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""
 

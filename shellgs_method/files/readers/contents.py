@@ -79,7 +79,7 @@ def left_out(path: Path, count: int, total: int, what: str) -> None:
 
 
 def say_left_out(path: Path, counts: Mapping[str, int]) -> None:
-    """Tell what a reader of building models leaves out, by kind: it is not seen from outside, or not read."""
+    """Report what a reader of building models leaves out, by kind: not visible from outside, or not read."""
     if some := [f"{count} {kind}" for kind, count in sorted(counts.items()) if count]:
         notice(f"{path}: left out what is not on the outside of a building: {', '.join(some)}.")
 

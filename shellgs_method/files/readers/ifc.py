@@ -229,7 +229,7 @@ def _one_project(path: Path, model: Any) -> None:
 
 
 def _complete(path: Path, model: Any, products: list) -> None:
-    """Give shapes without a context one of their kind, tell of parts without a placement, and move sets of a map.
+    """Give shapes without a context one of their kind, report parts without a placement, and move sets of a map.
 
     ifcopenshell leaves out shapes without a context, and does not cut such openings, without a word.
     """
@@ -328,7 +328,7 @@ def _has_body(product: Any) -> bool:
 
 
 def _tell_of_phases(path: Path, products: list, ifcopenshell: ModuleType) -> None:
-    """Tell the user which parts are not of the building as it stays: photographs show one state, a model may hold all.
+    """Report which parts are not of the building as it stays: photographs show one state, a model may hold all.
 
     By the Status of their property sets (PEnum_ElementStatus).
     """

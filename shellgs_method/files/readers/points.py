@@ -33,7 +33,7 @@ class Points:
 class Colours:
     """Scales a file's colours, piece by piece: white is the least of 1, 255 and 65535 that none so far exceeds.
 
-    Types do not tell, but for those of 8 bits: these are written as 16 or 32 too, and as floats.
+    Types do not show it, except those of 8 bits: these are written as 16 or 32 too, and as floats.
 
     Args:
         types: numpy's names of the types that the file has them in.

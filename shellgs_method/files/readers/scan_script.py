@@ -58,7 +58,7 @@ def read_las(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piec
 
 
 def read_e57(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
-    """Read the valid points of all scans, each moved by its pose; a scan without one tells nothing of its scanner."""
+    """Read the valid points of all scans, each moved by its pose; without one, the scanner's position is unknown."""
     import pye57
     from pye57.utils import convert_spherical_to_cartesian
 

@@ -67,7 +67,7 @@ def read_ptx(path: Path) -> Iterator[Points]:
     """Read a PTX: scans one after another, each with its size, its scanner's place, a matrix for row vectors, and a
     line for each ray, which is 0 0 0 where it hit nothing.
 
-    Points are moved by their scan's matrix. As in E57, a scan that is not moved tells nothing of its scanner.
+    Points are moved by their scan's matrix. As in E57, of a scan that is not moved, the scanner's position is unknown.
 
     Raises:
         ValueError: it is damaged, or cut off.

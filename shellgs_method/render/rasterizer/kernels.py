@@ -105,7 +105,7 @@ def step_back(
     Let g_i be the gradient of the loss w.r.t. the weight w_i = alpha_i T_i: the sum over the channels of the total's
     gradient times the splat's value. ``behind`` is the sum of g_j w_j over the splats behind, divided by their
     transmittance. Its update needs no division, behind += alpha_i (g_i - behind), and the gradient of the loss w.r.t.
-    alpha_i is T_i (g_i - behind). The channels may be in groups, whose parts are told apart.
+    alpha_i is T_i (g_i - behind). The channels may be in groups, whose parts are separate.
     """
     remaining, new, grad_z = iter(values), [], []
     for behind, gradients in zip(behinds, groups, strict=True):

@@ -55,7 +55,7 @@ class Loops:
     Attributes:
         kernels: arithmetic of the primitive.
         n_features: number of features, alpha included.
-        n_first: number of features whose gradients w.r.t. the screen position are told apart, if any are.
+        n_first: number of features whose gradients w.r.t. the screen position are separate, if any are.
     """
 
     kernels: Kernels
@@ -69,16 +69,16 @@ class Loops:
 
     @property
     def n_groups(self) -> int:
-        """Number of groups of features that are told apart."""
+        """Number of groups of features with separate gradients."""
         return 1 if self.n_first is None else 2
 
     @property
     def n_columns(self) -> int:
-        """Number of a splat's parameters, and of those whose gradients are told apart."""
+        """Number of a splat's parameters, and of those with separate gradients."""
         return self.kernels.n_shape + self.n_features + (0 if self.n_first is None else self.kernels.n_probed)
 
     def groups(self, gradients: Sequence) -> list[Sequence]:
-        """Gradients of the totals that are sums of weight times value, in the groups that are told apart."""
+        """Gradients of the totals that are sums of weight times value, in the groups with separate gradients."""
         weighted = gradients[: self.n_totals - self.kernels.n_unweighted]
         return [weighted] if self.n_first is None else [weighted[: self.n_first], weighted[self.n_first :]]
 
@@ -109,7 +109,7 @@ class Loops:
         """Go through a chunk back to front, given the gradients of the totals.
 
         Fills ``grad_params``, the gradients of the splats' parameters summed over a tile's pixels, followed by those of
-        the first ``n_probed`` due to the first group of features alone, if groups are told apart. Updates ``behinds``,
+        the first ``n_probed`` due to the first group of features alone, if groups are separate. Updates ``behinds``,
         one for each group (see :func:`~.kernels.step_back`), to before the chunk.
         """
         before = chunk.before

@@ -18,7 +18,7 @@ from shellgs_method.sim.collision.parts import Part, joined
 from shellgs_method.sim.ground import LEVEL, Ground
 
 DENSITY = 200.0
-"""Convex parts that there may be for 100 square metres of surface."""
+"""Maximum number of convex parts per 100 square metres of surface."""
 FINENESS = 16
 """Triangles for each part that a surface is decimated to before they are clustered."""
 THICKNESS = 0.3
@@ -35,7 +35,7 @@ COVERED = 0.001
 GROUND = 0.1
 """Height in metres above the ground up to which the fused surface is the ground's."""
 EYES = 24
-"""Number of cameras that tell what stands before the shell."""
+"""Number of cameras that decide what is in front of the shell."""
 BACKED = 0.9
 """Share of the cameras that see something in front of the shell which must also see the shell behind it."""
 SPECK = 0.01
@@ -84,7 +84,7 @@ def make_collider(
         fused: reconstructed surface, wound outwards.
         standing: mask of its triangles in front of the shell, from :func:`standing_before`.
         outside: mask of the shell's triangles that are seen from outside; None for all.
-        density: maximum number of convex parts for 100 square metres of surface, above 0.
+        density: maximum number of convex parts per 100 square metres of surface, above 0.
 
     Raises:
         SceneError: there is no surface to collide with.

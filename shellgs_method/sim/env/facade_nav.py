@@ -1,4 +1,4 @@
-"""Point-goal navigation before a facade, as a gymnasium environment."""
+"""Point-goal navigation in front of a facade, as a gymnasium environment."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class CameraSettings:
 
 
 class FacadeNav(gymnasium.Env, EzPickle):
-    """Drive a robot to a goal before a facade.
+    """Drive a robot to a goal in front of a facade.
 
     Action: each of the robot's actuators, from -1 to 1, scaled to its ``ctrlrange``; of the default robot these are the
     velocities ahead, to the left (1.5 m/s each) and around (1.5 rad/s to the left).
@@ -156,7 +156,7 @@ class FacadeNav(gymnasium.Env, EzPickle):
         return found
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin an episode; ``options`` may have ``start`` and ``goal`` (x, y in metres) and ``heading`` (radians)."""
+        """Start an episode; ``options`` may have ``start`` and ``goal`` (x, y in metres) and ``heading`` (radians)."""
         super().reset(seed=seed)
         options = options or {}
         mujoco.mj_resetData(self.model, self.data)

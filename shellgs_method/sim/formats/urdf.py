@@ -32,7 +32,7 @@ def world_urdf(assets: Sequence[Asset], ground: Ground) -> ET.Element:
 
 
 def _ground(root: ET.Element, ground: Ground) -> None:
-    """A slab, or a mesh; PyBullet takes its hull unless told that it is concave, and others pass over the attribute."""
+    """A slab, or a mesh; PyBullet uses its hull unless it is declared concave; others ignore the attribute."""
     link = _fixed(root, "ground")
     for kind in ("visual", "collision"):
         slab = add(link, kind, name="ground")
