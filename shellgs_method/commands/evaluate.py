@@ -38,7 +38,7 @@ def evaluate(
 
     measured = write_metrics(config, output_path, holdout, renders, points)
     metrics, truth = measured["results"], against_truth(measured["results"])
-    rows = {"against the shell": metrics, "against the truth": truth} if truth else {"run": metrics}
+    rows = {"against the shell": metrics, "against the ground truth": truth} if truth else {"run": metrics}
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
         console.print(rich_table(rows, columns, console.width))
     console.print(f"All metrics: {output_path}", soft_wrap=True)

@@ -41,13 +41,14 @@ def mesh(
     surface = decimated_mesh(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)
     write_mesh(output, surface, run.frame, metrics)
-    rows = {name: row for name, row in (("shell", metrics), ("truth", against_truth(metrics))) if "rendered" in row}
+    rows = {"against the shell": metrics, "against the ground truth": against_truth(metrics)}
+    rows = {name: row for name, row in rows.items() if "rendered" in row}
     console.print(
         f"{output}: {len(surface.faces)} triangles, voxels of {surface.metadata['voxel']:.3g}. {place(run.frame)}"
     )
     if not run.frame.metric and output.suffix.lower() in METRE_FORMATS:
         console.print(f"A {output.suffix} file is in metres, so programs take this unit as the metre: scale it there.")
     if rows:
-        console.print(rich_table(rows, SURFACE_COLUMNS, console.width, "Mesh in the held-out views, against"))
+        console.print(rich_table(rows, SURFACE_COLUMNS, console.width, "The mesh in the held-out views"))
     if "area_near_shell" in metrics:
         console.print(f"{metrics['area_near_shell']:.0%} of its area is within 20 cm of the shell.")

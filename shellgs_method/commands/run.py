@@ -96,7 +96,7 @@ def _take_all_steps(recipe: Recipe, scene: Path, results: Path, accept: bool, do
 
     begin("cameras of the photographs")
     _capture(recipe, scene, done)
-    begin("the shell's place")
+    begin("the alignment of the shell")
     _align(recipe, scene, accept, done)
     begin("the shell in the photographs")
     cast(scene, max_image_size=recipe.max_image_size)

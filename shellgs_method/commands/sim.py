@@ -33,7 +33,7 @@ def sim(
             raise FileNotFoundError(f"{config} does not exist")
     from shellgs_method.machine.progress import tell
 
-    tell("Importing what simulates")
+    tell("Importing the simulation")
     from shellgs_method.sim.simulate import simulate
 
     metrics, _ = simulate(configs, out, settings, console.print)

@@ -134,7 +134,7 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
         MetricsTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
         MetricsTable("regions", f"{scene}: held-out views, where training views see them", regions, by_region),
         MetricsTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
-        MetricsTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
+        MetricsTable("truth", f"{scene}: against the ground truth", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
     ]
     if any(run.variant.is_ablation for run in whole):
         ordered = [run for run in whole if run.variant.is_ablation or run.variant.name in ("photo-gs", "shellgs")]

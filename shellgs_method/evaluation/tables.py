@@ -64,8 +64,8 @@ REGION_COLUMNS = (
     Column("psnr_off_shell", "PSNR off the shell", max, ".2f"),
     Column("ssim_off_shell", "SSIM off the shell", max),
     Column("psnr_before_shell", "PSNR in front of the shell", max, ".2f"),
-    Column("truth_f_score_5cm_on_shell", "F5 to the truth, on the shell", max),
-    Column("truth_f_score_5cm_before_shell", "F5 to the truth, in front of the shell", max),
+    Column("truth_f_score_5cm_on_shell", "F5 to the ground truth, on the shell", max),
+    Column("truth_f_score_5cm_before_shell", "F5 to the ground truth, in front of the shell", max),
 )
 """Metrics by image region; pixels not covered by the training views are excluded."""
 

@@ -115,7 +115,7 @@ def _metrics(world: Path, chapter: Chapter, ground: Ground, test: bool) -> tuple
     }
     sentences = [
         f"{chapter.asset.name}: {len(collider.parts)} convex parts, which fill {collider.filled:.2g} m³ of air in "
-        f"front of the surface; {chapter.leaks.share:.2%} of the camera rays to the building pass them by 10 cm."
+        f"front of the surface; {chapter.leaks.share:.2%} of the camera rays to the building pass between them."
     ]
     front = Front.of(surface, chapter.made.eyes)
     if test:

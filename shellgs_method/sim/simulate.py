@@ -145,7 +145,7 @@ def _world(
     home.write(out, {"buildings": buildings, "trusted": trusted.facts})
     paths = trusted.eyes[:, :2]
     FreeSpace.of(parts, ground, paths).write(out, paths)
-    tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
+    tell("Testing and rendering in MuJoCo" if settings.test else "Rendering in MuJoCo")
     metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, ground, metrics)
     write_whole(out / "metrics.json", json.dumps(metrics, indent=1) + "\n")
