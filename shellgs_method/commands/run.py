@@ -169,7 +169,7 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     except SceneError as error:
         if report.is_file():
             open_page(report)
-        raise SceneError(f"{error}; {remedy} in {scene}.run") from error
+        raise SceneError(f"{error}; {remedy} to {scene}.run") from error
     if accept:
         done.note("accepted", key)
     if accept or accepted:
@@ -182,7 +182,7 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
             right, remedy = f"{right} and its unit is right", f"add --metres-per-shell-unit {likelier:g}, or {remedy}"
         raise SceneError(
             f"the alignment is {state}: if {right}, continue with `shellgs run --scene {named} --accept`; else "
-            f"{remedy} in {scene}.run"
+            f"{remedy} to {scene}.run"
         )
 
 

@@ -99,9 +99,9 @@ def _tell_of_metashape(lenses: Sequence[Lens], path: Path) -> None:
         off = max(off, float(np.linalg.norm(distort_pixels(lens, corners, K) - exchanged, axis=1).max()))
     if off > 1:
         notice(
-            f"{path} was made from Metashape's cameras, whose p1 and p2 nerfstudio 1.1.5 exchanges: if so, corners "
+            f"{path} was made from Metashape's cameras, whose p1 and p2 nerfstudio 1.1.5 confuses: if so, corners "
             f"of the photographs are up to {off:.0f} pixels off. Exchange the two there, or export undistorted "
-            "photographs; nothing, if that is done."
+            "photographs. Ignore this if that is done."
         )
 
 

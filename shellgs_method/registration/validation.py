@@ -206,7 +206,7 @@ class Unbending:
         yield check_of("bent_pixels", now / before if before else 1.0, name, "{:.2f}")
         farther = after.check_points - self.before.check_points
         if not np.isnan(farther):
-            name = "Bent: check points, median residual, less the one before"
+            name = "Bent: check points, median residual, minus the one before"
             yield check_of("bent_check", farther, name, "{:+.3f} m")
 
 
