@@ -500,6 +500,15 @@ def test_projects_of_an_ifc_in_different_units_are_refused(tmp_path: Path):
         read_geometry(file.save(tmp_path / "a.ifc"))
 
 
+def test_a_project_of_an_ifc_that_names_two_units_of_length_is_refused(tmp_path: Path):
+    """It was said to be "1 projects in different units"."""
+    file = made.ifc_house(unit=0.001)
+    (units,) = file.model.by_type("IfcUnitAssignment")
+    units.Units = [*units.Units, file.model.create_entity("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE")]
+    with pytest.raises(SceneError, match="names several units of length for its project"):
+        read_geometry(file.save(tmp_path / "a.ifc"))
+
+
 SCALES = [
     *((0.001, 0.001, None), (0.001, 0.001, 1.0), (1.0, 1.0, None), (0.001, 1.0, 1.0), (1.0, 0.9996, 1.0)),
     *((1.0, 0.9996, None), (0.3048, 0.3048, None), (0.001, 1000.0, None), (0.001, 1000.0, 1.0)),

@@ -209,7 +209,7 @@ def _one_project(path: Path, model: Any) -> None:
     """Leave the model one project: beside another, or a library, ifcopenshell takes any unit for metres and radians.
 
     Raises:
-        SceneError: there are several, in different units.
+        SceneError: there are several, in different units, or one names several of length.
         ValueError: there is none.
     """
     import ifcopenshell.util.unit
@@ -220,6 +220,8 @@ def _one_project(path: Path, model: Any) -> None:
     units = [unit for each in projects if each.UnitsInContext for unit in each.UnitsInContext.Units]
     lengths = [unit for unit in units if getattr(unit, "UnitType", None) == "LENGTHUNIT"]
     if len({ifcopenshell.util.unit.get_unit_scale(unit) for unit in lengths}) > 1:
+        if len(projects) == 1:
+            raise SceneError(f"the shell {path} names several units of length for its project: leave it the right one")
         raise SceneError(
             f"the shell {path} holds {len(projects)} projects in different units: export each to a file of its own"
         )
