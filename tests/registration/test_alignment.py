@@ -316,7 +316,7 @@ def test_geo_tags_that_no_place_agrees_with_are_told(tmp_path, mesh, views, poin
     """As of a building elsewhere, and of one in a model of a whole district, in which it is too small to be found."""
     shown = tagged(tmp_path, views, 1.0, bias=60.0)
     placement = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832"))
-    assert placement.history[1].endswith("cut a shell of a whole district to what photographs show.")
+    assert placement.history[1].endswith("crop a shell of a whole district to what photographs show.")
 
 
 def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
