@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int, Shaped, UInt8
+from jaxtyping import Float64, Int, Shaped
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
@@ -109,7 +109,7 @@ class _Sight:
     points: Float64[np.ndarray, "N 3"]
     colours: Float64[np.ndarray, "N 3"]
     cameras: Sequence[Camera]
-    photographs: Sequence[tuple[Camera, UInt8[np.ndarray, "H W 3"]]]
+    photographs: Sequence[tuple[Camera, Shown]]
     observed: Sequence[Int[np.ndarray, " M"]] | None = None
     """Indices of the points that each camera observes, where tracks are known."""
     features: Sequence[Float64[np.ndarray, "M 2"]] = (np.empty((0, 2)),)
@@ -124,7 +124,7 @@ class _Sight:
         if points.colours is not None and points.observed is None:  # with tracks, they are of one model
             colours = points.colours[some].astype(np.float64)
         of_these = np.ptp(colours, axis=0).max() > 0 and may_be_of(colours, [shown.pixels for shown in photographs])
-        images = [(shown.view.camera, shown.pixels) for shown in photographs if of_these]
+        images = [(shown.view.camera, shown) for shown in photographs if of_these]
         cameras, lenses = [view.camera for view in views], [view.lens for view in views]
         sight = cls(points.positions[some], colours, cameras, images, lenses=lenses)
         if points.observed is None:
@@ -186,9 +186,9 @@ class _Sight:
     def alike(self, points: np.ndarray) -> float:
         """Correlation of the points' colours with those of the photographs, in each; NaN if too few are compared."""
         compared = []
-        for camera, image in self.photographs:
-            inside, pixels, _ = in_view(camera, points)
-            compared.append((self.colours[inside], _at(pixels, image)))
+        for camera, shown in self.photographs:
+            pixels, colours = _kept(camera, points, self.colours, shown)
+            compared.append((colours, _at(pixels, shown.pixels)))
         return _correlation(compared)
 
     def away(self, points: np.ndarray) -> float:
@@ -218,7 +218,7 @@ class _Sight:
     def _moved(self, change: Callable[[np.ndarray], np.ndarray]) -> _Sight:
         """The same with other poses."""
         moved = partial(_with_pose, change=change)
-        photographs = [(moved(camera), image) for camera, image in self.photographs]
+        photographs = [(moved(camera), shown) for camera, shown in self.photographs]
         return replace(self, cameras=[moved(camera) for camera in self.cameras], photographs=photographs)
 
     def _unseen(self, seen: float) -> bool:
@@ -235,15 +235,24 @@ def _are_others(points: SparsePoints, photographs: Sequence[Shown]) -> bool:
         return False
     images = [shown.pixels for shown in photographs]
     own, others = [], []
-    for view, image in ((shown.view, shown.pixels) for shown in photographs):
-        inside, pixels, _ = in_view(view.camera, points.positions[points.of(view)])
-        colours = points.colours[points.of(view)][inside]
+    for shown in photographs:
+        image, of = shown.pixels, points.of(shown.view)
+        pixels, colours = _kept(shown.view.camera, points.positions[of], points.colours[of], shown)
         if may_be_of(colours, [image]):
             own.append((colours, _at(pixels, image)))
             alike = [other for other in images if other is not image and other.shape == image.shape]
             others += [(colours, _at(pixels, other)) for other in alike]
     theirs = _correlation(own)
     return theirs < _OWN and theirs < _correlation(others) + _MORE
+
+
+def _kept(
+    camera: Camera, points: Float64[np.ndarray, "N 3"], colours: Shaped[np.ndarray, "N 3"], shown: Shown
+) -> tuple[Float64[np.ndarray, "M 2"], Shaped[np.ndarray, "M 3"]]:
+    """Pixels and colours of the points that a camera sees where its photograph is not masked or transparent."""
+    inside, pixels, _ = in_view(camera, points)
+    kept = slice(None) if shown.mask is None else _at(pixels, shown.mask)
+    return pixels[kept], colours[inside][kept]
 
 
 def _ignored(points: SparsePoints, photographs: Sequence[Shown]) -> float:

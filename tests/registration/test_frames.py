@@ -216,6 +216,18 @@ def test_masks_that_ignore_nearly_all_points_are_told(points, views, tmp_path, i
     assert ("as if they were inverted: white is kept" in caplog.text) == inverted
 
 
+def test_points_are_not_compared_with_what_is_transparent(points, views, tmp_path, caplog):
+    cut_out = []
+    for number, view in enumerate(views):
+        image = Image.open(view.image).convert("RGBA")
+        image.paste((0, 0, 0, 0), (0, 0, image.width // 2, image.height))
+        image.save(tmp_path / f"{number}.png")
+        cut_out.append(replace(view, image=tmp_path / f"{number}.png"))
+    check_points(points, cut_out)
+    check_points(tracked(points, cut_out), cut_out)
+    assert not caplog.records
+
+
 def test_photographs_in_another_order_than_their_cameras_are_told(points, views, caplog):
     known = tracked(points, views)
     mixed = [replace(view, image=other.image) for view, other in zip(views, [*views[5:], *views[:5]], strict=True)]
