@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby, product
@@ -42,6 +42,8 @@ _WIDE = 2.5  # times as long as the other side: more than of any camera
 _PLAIN = 4.0  # deviation of the colours of a column that shows nothing, as of a black border: sky and ground are apart
 _DARK, _SMALL = 24, 64  # levels of what lies around the circle of a fisheye lens; pixels of its image's side
 _COMPARED, _SECTORS = 9, 12  # photographs; parts of a circle
+_Y, _X = np.mgrid[-1 : 1 : _SMALL * 1j, -1 : 1 : _SMALL * 1j]  # of the pixels of a square around the circle
+_RADIUS = np.hypot(_X, _Y)
 
 
 @dataclass(frozen=True)
@@ -149,13 +151,12 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         SceneError: some are two circles side by side, which a 360° camera records before it stitches them, or one.
     """
     sizes = {name: _size(folder / name) for name in names if name not in said}
-    for size, group in groupby(sorted(sizes, key=sizes.__getitem__), key=sizes.__getitem__):
-        alike = list(group)
-        if np.mean([_is_circle(folder / name) for name in _some(alike)]) > 0.5:
+    for alike, some, counted in _by_size(folder, sizes):
+        if np.mean([_is_circle(photograph) for photograph in some]) > 0.5:
             raise SceneError(
-                f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, such as {alike[0]}, are circles on black, of "
-                "a fisheye lens, which sees too much for a camera here: export them as perspective or, of a 360° "
-                "camera, as equirectangular. If they are not: --camera-type perspective"
+                f"{counted}, such as {alike[0]}, are circles on black, of a fisheye lens, which sees too much for a "
+                "camera here: export them as perspective or, of a 360° camera, as equirectangular. If they are not: "
+                "--camera-type perspective"
             )
     if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
         notice(
@@ -163,12 +164,10 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
             "as the other, or more: if they are panoramas, no camera fits them, and the other cameras are bent to "
             "match them: leave them out."
         )
-    twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
+    twice = {name: (width, height) for name, (width, height) in sizes.items() if width == 2 * height}
     found = set(said)
-    for size, group in groupby(twice, key=sizes.__getitem__):
-        alike = list(group)
-        what = f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, {alike[0]} for example,"
-        some = [folder / name for name in _some(alike)]
+    for alike, some, counted in _by_size(folder, twice):
+        what = f"{counted}, {alike[0]} for example,"
         if np.mean([_are_circles(photograph) for photograph in some]) > 0.5:
             raise SceneError(
                 f"{what} are two circles side by side, which a 360° camera records before it stitches them: export "
@@ -188,8 +187,12 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     return sorted(found)
 
 
-def _some(names: Sequence[str]) -> Sequence[str]:
-    return names[:: -(-len(names) // _COMPARED)]
+def _by_size(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> Iterator[tuple[list[str], list[Path], str]]:
+    """Names of the photographs of each size, the files of some of them, and their number and size in words."""
+    for (width, height), group in groupby(sorted(sizes, key=sizes.__getitem__), key=sizes.__getitem__):
+        alike = list(group)
+        some = [folder / name for name in alike[:: -(-len(alike) // _COMPARED)]]
+        yield alike, some, f"{len(alike)} photographs of {width}x{height} pixels"
 
 
 def _size(photograph: Path) -> tuple[int, int]:
@@ -201,11 +204,9 @@ def _are_circles(photograph: Path) -> bool:
     """Whether an image is two circles on black, side by side: those of two fisheye lenses, back to back."""
     with Image.open(photograph) as image:
         small = np.asarray(image.convert("L").resize((2 * _SMALL, _SMALL), Image.Resampling.BOX), np.float32)
-    y, x = np.mgrid[-1 : 1 : _SMALL * 1j, -1 : 1 : _SMALL * 1j]
-    radius = np.hypot(x, y)
-    around, within = radius > 1.15, (np.abs(x) < 0.4) & (radius > 0.6) & (radius < 0.9)  # above and below the middle
+    within = (np.abs(_X) < 0.4) & (_RADIUS > 0.6) & (_RADIUS < 0.9)  # above and below the middle
     halves = small[:, :_SMALL], small[:, _SMALL:]
-    return all(np.quantile(half[around], 0.95) < _DARK and half[within].mean() > 2 * _DARK for half in halves)
+    return all(_is_dark_beyond(half) and half[within].mean() > 2 * _DARK for half in halves)
 
 
 def _is_circle(photograph: Path) -> bool:
@@ -218,11 +219,15 @@ def _is_circle(photograph: Path) -> bool:
         left, top = (image.width - side) // 2, (image.height - side) // 2
         middle = image.convert("L").crop((left, top, left + side, top + side))
         small = np.asarray(middle.resize((_SMALL, _SMALL), Image.Resampling.BOX), np.float32)
-    y, x = np.mgrid[-1 : 1 : _SMALL * 1j, -1 : 1 : _SMALL * 1j]
-    radius, sector = np.hypot(x, y), np.floor((np.arctan2(y, x) / np.pi + 1) * _SECTORS / 2) % _SECTORS
-    within = (radius > 0.75) & (radius < 0.93)
+    sector = np.floor((np.arctan2(_Y, _X) / np.pi + 1) * _SECTORS / 2) % _SECTORS
+    within = (_RADIUS > 0.75) & (_RADIUS < 0.93)
     around = [small[within & (sector == number)].mean() > 2 * _DARK for number in range(_SECTORS)]
-    return bool(np.quantile(small[radius > 1.15], 0.95) < _DARK and np.mean(around) > 0.8)
+    return bool(_is_dark_beyond(small) and np.mean(around) > 0.8)
+
+
+def _is_dark_beyond(square: Float32[np.ndarray, "S S"]) -> bool:
+    """Whether there is nothing beyond the circle in a square."""
+    return bool(np.quantile(square[_RADIUS > 1.15], 0.95) < _DARK)
 
 
 def _seam(photograph: Path) -> float:
