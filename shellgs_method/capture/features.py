@@ -44,6 +44,7 @@ def extract(
             a fifth of the light one in 25 was left.
         camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
     """
+    pycolmap.Database.open(database).close()  # makes it
     for lens in lenses:
         if masks:
             _add_white(Path(masks), lens["names"], lens["size"])
@@ -56,9 +57,13 @@ def extract(
             width, height = lens["size"]
             reader.camera_model = CALIBRATED
             reader.camera_params = f"{lens['focal']},{width / 2},{height / 2}"
+        if camera := _camera_of(database, lens["names"]):
+            reader.existing_camera_id = camera
+        # Images have numbers in this order, on which the cameras found depend, not in that of threads that finish.
+        pycolmap.import_images(
+            database, photographs, pycolmap.CameraMode.SINGLE, image_names=lens["names"], options=reader
+        )
         for contrast in sorted({contrasts[name] for name in lens["names"]}):
-            if camera := _camera_of(database, lens["names"]):
-                reader.existing_camera_id = camera
             options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
             options.sift.max_num_features = sift["max_num_features"]
             options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= _LARGE else -1

@@ -26,6 +26,7 @@ import torch
 from nerfstudio.scripts import train
 
 from shellgs_method import cli
+from shellgs_method.files.colmap import read_model
 from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
@@ -159,7 +160,18 @@ def contents(folder: Path) -> dict[str, object]:
 
 
 def digest(path: Path) -> object:
-    """What a file holds: a checkpoint numbers, since equal ones are not always stored as the same bytes."""
+    """What a file holds: a checkpoint numbers, since equal ones are not always stored as the same bytes.
+
+    All files of a COLMAP model hold that model: its bundle adjustment adds on several threads, whatever it may use, and
+    ends up to 1e-13 apart.
+    """
+    if path.parent.parent.name == "sparse":
+        model = read_model(path.parent)
+        numbers = [np.array(camera.params) for camera in model.cameras.values()]
+        numbers += [part for image in model.images.values() for part in (image.rotation, image.centre)]
+        rounded = np.concatenate([part.ravel() for part in (*numbers, model.points.positions)]).round(6) + 0.0  # no -0
+        names = [image.name for image in model.images.values()]
+        return names, hashlib.sha256(rounded.tobytes() + model.points.tracks.tobytes()).hexdigest()
     if path.suffix != ".ckpt":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     return plain(torch.load(path, weights_only=True))
