@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Shaped
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.capture.lenses import Lens
@@ -202,8 +202,7 @@ def _size(photograph: Path) -> tuple[int, int]:
 
 def _are_circles(photograph: Path) -> bool:
     """Whether an image is two circles on black, side by side: those of two fisheye lenses, back to back."""
-    with Image.open(photograph) as image:
-        small = np.asarray(image.convert("L").resize((2 * _SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+    small = _small(photograph, 2 * _SMALL)
     within = (np.abs(_X) < 0.4) & (_RADIUS > 0.6) & (_RADIUS < 0.9)  # above and below the middle
     halves = small[:, :_SMALL], small[:, _SMALL:]
     return all(_is_dark_beyond(half) and half[within].mean() > 2 * _DARK for half in halves)
@@ -214,15 +213,18 @@ def _is_circle(photograph: Path) -> bool:
 
     All around within its edge there is something, as there is not of an object on black, and nothing beyond it.
     """
-    with Image.open(photograph) as image:
-        side = min(image.size)
-        left, top = (image.width - side) // 2, (image.height - side) // 2
-        middle = image.convert("L").crop((left, top, left + side, top + side))
-        small = np.asarray(middle.resize((_SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+    small = _small(photograph, _SMALL)
     sector = np.floor((np.arctan2(_Y, _X) / np.pi + 1) * _SECTORS / 2) % _SECTORS
     within = (_RADIUS > 0.75) & (_RADIUS < 0.93)
     around = [small[within & (sector == number)].mean() > 2 * _DARK for number in range(_SECTORS)]
     return bool(_is_dark_beyond(small) and np.mean(around) > 0.8)
+
+
+def _small(photograph: Path, width: int) -> Float32[np.ndarray, "S {width}"]:
+    """The middle of a photograph of that aspect, in grey; JPEGs are decoded small."""
+    with Image.open(photograph) as image:
+        image.draft("L", (4 * width, 4 * _SMALL))
+        return np.asarray(ImageOps.fit(image.convert("L"), (width, _SMALL), Image.Resampling.BOX), np.float32)
 
 
 def _is_dark_beyond(square: Float32[np.ndarray, "S S"]) -> bool:
