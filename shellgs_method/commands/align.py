@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, table, warn
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, better_start, console, table, warn
 from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from shellgs_method.registration.frames import ShellPlace
     from shellgs_method.registration.validation import Validation
     from shellgs_method.shell import ShellMesh
+
+
+class RefusedError(SceneError):
+    """The validation refuses the alignment, and the report shows why."""
 
 
 @bounded
@@ -115,9 +119,16 @@ def align(
     if validation.verdict == "refused":
         kept = f"{target} is unchanged" if target.exists() else "nothing is written"
         why = f"{misplacement}; " if misplacement else ""
-        advice = "; pick points with `shellgs pick`, and give them with --picks" if placement.proposed else ""
-        advice += f"; {frame}" if matrix and (frame := frame_of_matrix(layout)) else ""
-        raise SceneError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}{advice}")
+        frame = frame_of_matrix(layout) if matrix else ""
+        advice = frame or better_start(
+            scene,
+            shell or placement.alignment.files(scene),
+            metres_per_shell_unit,
+            crs,
+            refined=bool(refine or misplacement or placement.proposed),
+            picked=bool(picks),
+        )
+        raise RefusedError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}; {advice}")
 
 
 @dataclass(frozen=True)

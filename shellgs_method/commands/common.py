@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import webbrowser
 from functools import partial
@@ -60,6 +61,15 @@ def shell_words(metres_per_shell_unit: float | None, crs: str | None) -> list[st
     """Words of a further command on the same shell: its unit and system, as far as they were given."""
     unit = ["--metres-per-shell-unit", str(metres_per_shell_unit)] if metres_per_shell_unit is not None else []
     return unit + (["--crs", crs] if crs else [])
+
+
+def better_start(
+    scene: Path, shell: Sequence[Path], unit: float | None, crs: str | None, *, refined: bool, picked: bool
+) -> str:
+    """What aligns a shell better, in words: a refinement, unless there was one, or picks."""
+    refine = "" if refined else "add --refine 0.3, or "
+    pick = shlex.join(["shellgs", "pick", *map(str, (scene, *shell)), *shell_words(unit, crs)])
+    return f"{refine}pick {'more ' if picked else ''}points ({pick}) and add --picks picks.txt"
 
 
 def open_page(path: Path) -> None:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.commands.align import align
+from shellgs_method.commands.align import RefusedError, align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
-from shellgs_method.commands.common import console, open_page, shell_words
+from shellgs_method.commands.common import better_start, console, open_page
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.recipe import Recipe, cameras_of, settled
 from shellgs_method.commands.sim import sim as simulate
@@ -145,10 +145,8 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     proposed, named = not recipe.starts, shlex.quote(str(scene))
     accepted = done.has("accepted", key)
     written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
-    refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
-    words = *map(str, shell), *shell_words(recipe.metres_per_shell_unit, recipe.crs)
-    pick = f"shellgs pick {named} {shlex.join(words)}"
-    remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and add --picks picks.txt"
+    refined, picked, unit = bool(recipe.refine or proposed), bool(recipe.picks), recipe.metres_per_shell_unit
+    remedy = better_start(scene, shell, unit, recipe.crs, refined=refined, picked=picked)
     try:
         if not done.has("align", key) or not _is_there(written, scene):
             align(
@@ -167,9 +165,9 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
         elif accept and proposed and not accepted:
             align(scene, accept=True, bundle_adjust=recipe.bundle_adjust)
     except SceneError as error:
-        if report.is_file():
+        if isinstance(error, RefusedError):
             open_page(report)
-        raise SceneError(f"{error}; {remedy} to {scene}.run") from error
+        raise SceneError(f"{error}; the settings are in {scene}.run") from error
     if accept:
         done.note("accepted", key)
     if accept or accepted:
