@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def evaluate(
     config: RunConfig,
-    output_path: Path = Path("eval.json"),
+    output_path: Optional[Path] = None,
     holdout: Optional[Literal["A", "B"]] = None,
     renders: Optional[Path] = None,
     points: Optional[Path] = None,
@@ -22,7 +22,7 @@ def evaluate(
 
     Args:
         config: The run's config.yml. Train methods other than ours with `ns-train METHOD … facade-data`.
-        output_path: Output JSON file.
+        output_path: Output JSON file. If not set: metrics.json beside the config.
         holdout: Measure only these vertical bands of the facade, whatever the run held out.
         renders: Folder for the renders of each held-out view, as npz.
         points: Text file of surveyed points, one per line: name X Y Z in the shell's coordinates. The distances of the
@@ -36,6 +36,7 @@ def evaluate(
     from shellgs_method.compare.measure import write_metrics
     from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, against_truth, rich_table
 
+    output_path = output_path or config.with_name("metrics.json")
     measured = write_metrics(config, output_path, holdout, renders, points)
     metrics, truth = measured["results"], against_truth(measured["results"])
     rows = {"against the shell": metrics, "against the ground truth": truth} if truth else {"run": metrics}

@@ -820,19 +820,19 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
     return runs
 
 
-def test_evaluate_measures_surveyed_points(measured, shellgs, tmp_path):
+def test_evaluate_measures_surveyed_points_and_writes_beside_the_config(measured, shellgs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with (tmp_path / "points.txt").open("w") as file:
         run = TrainedRun.load(measured[1].config)
         surface = run.surface(0.5)
         for k in (0, len(surface.vertices) // 2, -1):
             x, y, z = surface.vertices[k] + run.frame.offset
             file.write(f"{x:.6f} {y:.6f} {z:.6f}\n")
-    told = shellgs(
-        "evaluate", measured[1].config, "--points", tmp_path / "points.txt", "--output-path", tmp_path / "e.json"
-    )
+    told = shellgs("evaluate", measured[1].config, "--points", "points.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["points.txt"]  # ns-eval's eval.json may lie there
     assert "The surface is 0.000 m from 3 of 3 points in the median, 0.000 m at most." in told
     assert "3 pairs" in told
-    written = json.loads((tmp_path / "e.json").read_text())
+    written = json.loads(measured[1].config.with_name("metrics.json").read_text())
     assert written["surveyed"]["before"] == {name: pytest.approx(0, abs=1e-5) for name in "123"}
     assert written["results"]["psnr"] == json.loads(measured[1].metrics().read_text())["results"]["psnr"]
     assert "refused" in shellgs("evaluate", measured[1].config, "--points", tmp_path / "no.txt")
