@@ -135,18 +135,20 @@ def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs,
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
-def test_a_run_is_advised_once_to_pick_points_and_only_where_the_alignment_is_refused(inputs, shellgs):
+def test_a_run_is_advised_once_to_pick_points_and_only_where_the_alignment_is_refused(inputs, shellgs, monkeypatch):
     photographs, shell, matrix = inputs
+    opened = []
+    monkeypatch.setattr(run_command, "open_page", opened.append)
     np.savetxt("far.txt", np.loadtxt(matrix) @ np.diag([1e3, 1e3, 1e3, 1]))
     told = shellgs("run", photographs, shell, "--matrix", "far.txt")
-    assert "opened scene/shell/report/index.html" in told
+    assert opened == [Path("scene/shell/report/index.html")]
     assert told.count("pick points") == 1
     assert told.endswith("(shellgs pick scene shell.ply) and add --picks picks.txt; the settings are in scene.run")
     shell.write_text("cut off")
     told = shellgs("run")
     assert "shell.ply cannot be read" in told
-    assert "opened" not in told
     assert "pick points" not in told
+    assert len(opened) == 1
 
 
 def test_photographs_are_captured_where_there_are_no_cameras_and_again_if_they_are_others(inputs, shellgs, monkeypatch):
