@@ -85,8 +85,8 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, 
     offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
     to_shell = np.diag([1 / metres] * 3 + [1.0])
     to_shell[:3, 3] = offset / metres
-    crs = alignment.crs if in_metres(alignment.crs) else ""  # one in feet is not that of results in metres
-    return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up, crs=crs)
+    to_scene = alignment.shell_to_scene @ to_shell
+    return Frame("shell", to_scene, offset, metric=True, up=up, crs=in_metres(alignment.crs))
 
 
 def scene_frame(up: Float64[np.ndarray, " 3"] = Z, middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:

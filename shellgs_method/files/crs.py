@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -65,10 +65,25 @@ def known_crs(text: str) -> CRS | None:
     return crs if is_named and len(crs.axis_info) > 1 else None  # not heights alone
 
 
-def in_metres(system: str) -> bool:
-    """Whether a system that PROJ knows counts metres; one that it does not know is not doubted."""
+def in_metres(system: str) -> str:
+    """A system, or the same that counts metres in the place of feet, as WKT; one that PROJ does not know as it is."""
+    from pyproj import CRS
+
     crs = known_crs(system)
-    return crs is None or all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in crs.axis_info)
+    if crs is None or all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in crs.axis_info):
+        return system
+    return CRS.from_json_dict(_in_metres(crs.to_json_dict()) | {"name": f"{crs.name} in metres"}).to_wkt()
+
+
+def _in_metres(described: Any) -> Any:
+    """A part of a PROJJSON whose axes count metres, without codes; parameters have units of their own."""
+    if isinstance(described, list):
+        return [_in_metres(each) for each in described]
+    if not isinstance(described, dict):
+        return described
+    is_axis = "direction" in described and isinstance(unit := described.get("unit"), dict)
+    changed = {"unit": "metre"} if is_axis and unit["type"] == "LinearUnit" else {}
+    return {key: _in_metres(value) for key, value in described.items() if key != "id"} | changed
 
 
 def name_of(crs: CRS) -> str:

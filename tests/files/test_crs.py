@@ -16,7 +16,7 @@ from laspy.vlrs.known import GeoKeyEntryStruct
 from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.crs import conversion, converter, crs_there, given_crs, known_crs, name_of
+from shellgs_method.files.crs import conversion, converter, crs_there, given_crs, in_metres, known_crs, name_of
 from shellgs_method.files.crs_of_files import crs_of, metres_of
 
 UTM = "EPSG:25832"
@@ -232,6 +232,18 @@ def test_a_shell_that_is_not_in_the_area_of_its_system_is_not_said_to_be_in_it(c
 def test_a_system_from_the_middle_of_the_earth_is_refused():
     with pytest.raises(SceneError, match="is geocentric"):
         metres_of("EPSG:4978", None, (Path("scan.las"),))
+
+
+@pytest.mark.parametrize("system", ["EPSG:2263", "EPSG:2263+6360", "EPSG:2314", "EPSG:25832"])
+def test_a_system_in_metres_has_the_same_places(system):
+    crs, metric = pyproj.CRS(system), pyproj.CRS(in_metres(system))
+    metres = crs.axis_info[0].unit_conversion_factor
+    assert [axis.unit_name for axis in metric.axis_info] == ["metre"] * len(crs.axis_info)
+    assert (metric == crs) == (metres == 1)
+    origin = np.array([[500_000.0, 200_000, 30][: len(crs.axis_info)]])
+    wgs84 = pyproj.CRS("EPSG:4326" if len(crs.axis_info) == 2 else "EPSG:4979")
+    places = conversion(crs, wgs84)(origin), conversion(metric, wgs84)(metres * origin)
+    np.testing.assert_allclose(*places, rtol=1e-12)
 
 
 def test_nothing_is_converted_to_a_local_system():
