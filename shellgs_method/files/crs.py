@@ -81,9 +81,10 @@ def _in_metres(described: Any) -> Any:
         return [_in_metres(each) for each in described]
     if not isinstance(described, dict):
         return described
-    is_axis = "direction" in described and isinstance(unit := described.get("unit"), dict)
-    changed = {"unit": "metre"} if is_axis and unit["type"] == "LinearUnit" else {}
-    return {key: _in_metres(value) for key, value in described.items() if key != "id"} | changed
+    unit = described.get("unit")
+    is_length = "direction" in described and isinstance(unit, dict) and unit["type"] == "LinearUnit"
+    kept = {key: _in_metres(value) for key, value in described.items() if key != "id"}
+    return kept | ({"unit": "metre"} if is_length else {})
 
 
 def name_of(crs: CRS) -> str:
