@@ -22,6 +22,8 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # which its modules turn into an ImportError
+            raise KeyboardInterrupt from None
         missing = system.missing_libraries()
         remedy = (
             system.install_command(missing.values())

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shellgs_method.machine import system
+from shellgs_method.machine import open3d, system
 
 ROOT = Path(__file__).parents[2]
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
@@ -134,3 +134,12 @@ def test_a_command_that_cannot_load_open3d_ends_with_one_sentence(tmp_path):
     assert done.stderr.splitlines()[-1].startswith("shellgs: Open3D cannot be loaded (libGL.so.1: cannot open shared")
     assert "apt-get install -y libgl1" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_ctrl_c_while_open3d_is_imported_is_no_fault_of_open3d(tmp_path, monkeypatch):
+    """As pybind11 raises it from the import of a module in C++."""
+    (tmp_path / "open3d.py").write_text("raise ImportError('initialization failed') from KeyboardInterrupt()")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        open3d.import_open3d()
