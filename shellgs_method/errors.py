@@ -132,6 +132,6 @@ def refusals_end_the_program() -> Iterator[None]:
         raise SystemExit(f"shellgs: {error if ours else explained(error)}") from error
     except SceneError as error:
         raise SystemExit(f"shellgs: {error}") from error
-    except KeyboardInterrupt:
-        print("shellgs: stopped", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print("; ".join(["shellgs: stopped", *error.args]), file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None

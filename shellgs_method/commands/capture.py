@@ -8,11 +8,12 @@ from typing import Annotated
 import tyro
 
 from shellgs_method.capture.config import CaptureConfig
-from shellgs_method.commands.common import Scene, console, warn
+from shellgs_method.commands.common import Scene, console, resumable, warn
 
 _CAPTURE = CaptureConfig()
 
 
+@resumable
 def capture(
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
     scene: Scene,
@@ -29,10 +30,7 @@ def capture(
     """
     from shellgs_method.capture import SUSPICIOUS_ERROR, capture
 
-    try:
-        summary = capture(source, scene, config, console=console)
-    except KeyboardInterrupt:
-        raise SystemExit("shellgs: interrupted; the same command resumes") from None
+    summary = capture(source, scene, config, console=console)
     total = len(summary.registered) + len(summary.missing)
     console.print(
         f"{len(summary.registered)} of {total} photographs registered; {summary.points} points, mean track length "

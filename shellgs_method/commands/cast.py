@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import FromOne, Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, shell_words, warn
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, resumable, shell_words, warn
 from shellgs_method.commands.panels import save_panel, views_with_maps
 from shellgs_method.errors import SceneError
 
@@ -35,6 +35,7 @@ LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
 
+@resumable
 @bounded
 def cast(
     scene: Scene,

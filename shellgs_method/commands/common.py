@@ -6,9 +6,9 @@ import os
 import shlex
 import sys
 import webbrowser
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec
 
 import tyro
 from rich.console import Console
@@ -36,7 +36,21 @@ Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 PATHS = ScenePaths()
 ClusterFlags = Annotated[Cluster, tyro.conf.arg(name="")]
 CLUSTER = Cluster()
+P = ParamSpec("P")
 Mesher = Literal["planes", "bpa", "poisson"]
+
+
+def resumable(command: Callable[P, None]) -> Callable[P, None]:
+    """Let a command say at Ctrl-C that it resumes if it is given again."""
+
+    @wraps(command)
+    def interrupted(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command resumes") from None
+
+    return interrupted
 
 
 def table(*headings: str, title: str | None = None) -> Table:

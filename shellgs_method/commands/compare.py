@@ -9,10 +9,21 @@ from typing import Annotated, Literal, Optional
 import tyro
 
 from shellgs_method.bounds import Count, FromOne, Jobs, Seed, bounded
-from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page, required
+from shellgs_method.commands.common import (
+    CLUSTER,
+    PATHS,
+    ClusterFlags,
+    Paths,
+    console,
+    launch,
+    open_page,
+    required,
+    resumable,
+)
 from shellgs_method.errors import check_output_folder
 
 
+@resumable
 @bounded
 def compare(
     scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="SCENE [SCENE ...]")],

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from shellgs_method.bounds import FromOne, Pixels, Seed, Views, bounded
-from shellgs_method.commands.common import console, open_page
+from shellgs_method.commands.common import console, open_page, resumable
 from shellgs_method.errors import SceneError, check_output_folder
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 METHODS = ("photo-gs", "shellgs-metric")
 
 
+@resumable
 @bounded
 def demo(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("demo"),

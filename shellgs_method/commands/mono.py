@@ -7,7 +7,7 @@ from typing import Annotated, Optional, Union
 import tyro
 
 from shellgs_method.bounds import FromOne, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console, warn
+from shellgs_method.commands.common import PATHS, Paths, Scene, console, resumable, warn
 from shellgs_method.commands.panels import save_panel
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
@@ -22,6 +22,7 @@ MonoSource = Annotated[
 _MOGE = MoGe2()
 
 
+@resumable
 @bounded
 def mono(
     scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[FromOne] = None, paths: Paths = PATHS

@@ -16,7 +16,7 @@ import tyro
 from shellgs_method.commands.align import RefusedError, align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
-from shellgs_method.commands.common import better_start, console, open_page
+from shellgs_method.commands.common import better_start, console, open_page, resumable
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.recipe import Recipe, cameras_of, settled
 from shellgs_method.commands.sim import sim as simulate
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _DEFAULT = Recipe()
 
 
+@resumable
 def run(
     recipe: Annotated[Recipe, tyro.conf.arg(name="")] = _DEFAULT,
     scene: Path = Path("scene"),

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from shellgs_method.bounds import TINY, Bounds, FromOne, Jobs, Seed, bounded
-from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch
+from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch, resumable
 from shellgs_method.commands.merge import report_seams
 from shellgs_method.errors import check_output_folder
 
 
+@resumable
 @bounded
 def street(
     scene: Scene,

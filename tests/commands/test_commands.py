@@ -18,7 +18,7 @@ from rich.console import Console
 
 from shellgs_method import cli
 from shellgs_method.cli import main
-from shellgs_method.commands.common import open_page, table
+from shellgs_method.commands.common import open_page, resumable, table
 from shellgs_method.errors import INTERRUPTED, SceneError
 from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.machine import doctor
@@ -287,15 +287,20 @@ def test_doctor_ends_with_what_is_needed_and_missing(shellgs, monkeypatch):
 
 
 def test_a_command_that_is_stopped_by_its_user_says_so_without_a_traceback(monkeypatch, capsys):
-    def street() -> None:
+    def align() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "COMMANDS", (street, *cli.COMMANDS[-1:]))
-    monkeypatch.setattr("sys.argv", ["shellgs", "street"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == INTERRUPTED
-    assert capsys.readouterr().err.splitlines() == ["shellgs: stopped"]
+    @resumable
+    def cast() -> None:
+        align()
+
+    for command, told in ((align, "shellgs: stopped"), (cast, "shellgs: stopped; the same command resumes")):
+        monkeypatch.setattr(cli, "COMMANDS", (command, *cli.COMMANDS[-1:]))
+        monkeypatch.setattr("sys.argv", ["shellgs", command.__name__])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == INTERRUPTED
+        assert capsys.readouterr().err.splitlines() == [told]
 
 
 @pytest.mark.parametrize("command", ["compare", "merge", "pick", "sim"])
