@@ -104,7 +104,7 @@ class Points:
         positions: in the model's frame.
         colours: RGB.
         tracks: observations of the points, by :func:`tracks_of`, in their order.
-        ids: COLMAP's number of each point.
+        ids: COLMAP's number of each point, which may be negative: it has 64 bits without a sign.
     """
 
     positions: Float64[np.ndarray, "N 3"]
@@ -226,20 +226,22 @@ def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -
     with (folder / "cameras.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(model.cameras)))
         for number, camera in model.cameras.items():
-            file.write(struct.pack("<iiQQ", number, kinds.index(camera.model), camera.width, camera.height))
+            file.write(struct.pack("<IiQQ", number, kinds.index(camera.model), camera.width, camera.height))
             file.write(struct.pack(f"<{len(camera.params)}d", *camera.params))
     with (folder / "images.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(model.images)))
         for number, image in model.images.items():
-            file.write(struct.pack("<i7di", number, *image.quaternion, *image.translation, image.camera))
+            file.write(struct.pack("<I7dI", number, *image.quaternion, *image.translation, image.camera))
             name, features = image.name.encode(errors="surrogateescape"), image.features
             file.write(name + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
     points = model.points
-    observed = np.stack([points.tracks["image"], points.tracks["keypoint"]], axis=1).astype("<i4")
+    observed = np.stack([points.tracks["image"], points.tracks["keypoint"]], axis=1).astype("<u4")
     tracks = np.split(observed, np.searchsorted(points.tracks["point"], np.arange(1, len(points.ids))))
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(points.ids)))
-        for k, (number, track) in enumerate(zip(points.ids, tracks, strict=False)):  # one of no points
+        for k, (number, track) in enumerate(
+            zip(points.ids.astype(np.uint64), tracks, strict=False)
+        ):  # one of no points
             file.write(struct.pack("<Q3d3Bd", number, *points.positions[k], *points.colours[k], errors[k]))
             file.write(struct.pack("<Q", len(track)) + track.tobytes())
 
@@ -391,7 +393,7 @@ class _Bytes:
 def _binary_cameras(file: _Bytes) -> dict[int, ColmapCamera]:
     cameras = {}
     for _ in file.records():
-        number, model, width, height = file.take("<iiQQ")
+        number, model, width, height = file.take("<IiQQ")
         if not 0 <= model < len(_MODELS):
             raise SceneError(
                 f"its camera {number} has the unknown model number {model}: if it is not damaged but from a newer "
@@ -424,7 +426,7 @@ def _whole(word: str) -> int:
 def _binary_images(file: _Bytes) -> dict[int, ColmapImage]:
     images = {}
     for _ in file.records():
-        number, *pose, camera = file.take("<i7di")
+        number, *pose, camera = file.take("<I7dI")
         name = file.text()
         (count,) = file.take("<Q")
         images[number] = ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera, name, file.array(KEYPOINT, count))
@@ -469,7 +471,7 @@ def _binary_points(file: _Bytes) -> Points:
     for _ in file.records():
         points += (point := file.part(_POINT.itemsize))
         tracks += file.part(8 * int.from_bytes(point[-8:], "little"))
-    known, observed = np.frombuffer(points, _POINT), np.frombuffer(tracks, "<i4").reshape(-1, 2)
+    known, observed = np.frombuffer(points, _POINT), np.frombuffer(tracks, "<u4").reshape(-1, 2)
     of = np.repeat(np.arange(len(known)), known["observations"].astype(np.int64))
     position, colour = known["position"].copy(), known["colour"].copy()
     return Points(position, colour, tracks_of(of, *observed.T), known["id"].astype(np.int64))

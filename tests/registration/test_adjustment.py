@@ -152,7 +152,13 @@ def write(scene: Path, model: Model, mesh: ShellMesh, alignment: np.ndarray | No
     return matrix
 
 
-def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model):
+@pytest.mark.parametrize("above", [0, 2**32 - 1000])
+def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model, above: int):
+    """COLMAP's numbers have 32 bits without a sign, those of points 64."""
+    tracks = model.points.tracks.copy()
+    tracks["image"] += above
+    points = replace(model.points, tracks=tracks, ids=model.points.ids - above)
+    model = replace(model, images={number + above: image for number, image in model.images.items()}, points=points)
     write_model(tmp_path / "model", model, np.zeros(len(model.points.ids)))
     again = read_model(tmp_path / "model")
     assert again.cameras == model.cameras
@@ -161,6 +167,7 @@ def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model):
         np.testing.assert_array_equal(again.images[number].features, image.features)
     np.testing.assert_array_equal(again.points.positions, model.points.positions)
     np.testing.assert_array_equal(again.points.tracks, model.points.tracks)
+    np.testing.assert_array_equal(again.points.ids, model.points.ids)
 
 
 def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent: Model):
