@@ -155,8 +155,8 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         if np.mean([_is_circle(photograph) for photograph in some]) > 0.5:
             raise SceneError(
                 f"{counted}, such as {alike[0]}, are circles on black, of a fisheye lens, which sees too much for a "
-                "camera here: export them as perspective or, of a 360° camera, as equirectangular. If they are not: "
-                "--camera-type perspective"
+                "camera here: leave them out, or export them as perspective or, of a 360° camera, as equirectangular. "
+                "If they are not: --camera-type perspective"
             )
     if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
         notice(
