@@ -23,7 +23,7 @@ def rasterize(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
+    opacities: Float[Tensor, " N"],
     features: Float[Tensor, "N C"],
     camera: Camera,
     primitive: Literal["3d", "2d"] = "3d",

@@ -26,7 +26,7 @@ class Scene:
     means: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
     scales: Float[Tensor, "N 3"]
-    opacities: Float[Tensor, "N"]
+    opacities: Float[Tensor, " N"]
     sh: Float[Tensor, "N 16 3"]
 
     def splats(self, n_features: int) -> list[Tensor]:

@@ -258,7 +258,7 @@ class FacadeModel(SplatfactoModel):
         if self.exposures is not None and coarse.exposures is not None:
             self.exposures.parameter.data = coarse.exposures.to(self.device)
 
-    def outside(self) -> Bool[Tensor, "N"]:
+    def outside(self) -> Bool[Tensor, " N"]:
         """Gaussians that have left their block: merged, it would lack what they show of it in its photographs."""
         return (
             self.means.new_zeros(self.num_points).bool() if self.region is None else ~self.region.extended(self.means)
@@ -339,7 +339,7 @@ class FacadeModel(SplatfactoModel):
         inside = self.crop_box.within(gaussians["means"]).squeeze(-1)
         return {name: values[inside] for name, values in gaussians.items()}
 
-    def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+    def coverage(self, camera: Camera) -> tuple[Float[Tensor, " N"], Bool[Tensor, " N"]]:
         """:meth:`ViewRenderer.coverage` of a training view by the Gaussians that are trained."""
         area, in_view = self.renderer.coverage(self._gaussians, camera, self._renders_geometry)
         return area[: self.num_points], in_view[: self.num_points]

@@ -280,7 +280,7 @@ class FacadeTrainer(Trainer):
             CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
         self._check_any_left(self.step, "training views show none of them: lower the learning rates")
 
-    def _remove(self, gone: Bool[Tensor, "N"]) -> int:
+    def _remove(self, gone: Bool[Tensor, " N"]) -> int:
         """Remove Gaussians with their optimizers' moments and the densification's sums; return their number."""
         model = self.pipeline.model
         if count := int(gone.sum()):

@@ -160,7 +160,7 @@ def _cells(run: TrainedRun) -> Sequence[Cell]:
     return [cell.moved(run.datamanager.scene_to_world) for cell in blocks.cells]
 
 
-def from_cuts(points: Float[np.ndarray, "N 3"], cells: Sequence[Cell]) -> Float64[np.ndarray, "N"]:
+def from_cuts(points: Float[np.ndarray, "N 3"], cells: Sequence[Cell]) -> Float64[np.ndarray, " N"]:
     """Distance of points from the nearest cut that bounds the core that they lie in; infinite where there is none."""
     distances = np.full(len(points), np.inf)
     for cell in cells:
@@ -209,8 +209,8 @@ def _doubles(
 
 
 def on_another(
-    points: Float64[np.ndarray, "N 3"], sizes: Float64[np.ndarray, "N"], blocks: Int[np.ndarray, "N"]
-) -> Bool[np.ndarray, "N"]:
+    points: Float64[np.ndarray, "N 3"], sizes: Float64[np.ndarray, " N"], blocks: Int[np.ndarray, " N"]
+) -> Bool[np.ndarray, " N"]:
     """Which points lie on one of another block.
 
     Args:

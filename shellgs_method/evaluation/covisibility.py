@@ -71,7 +71,7 @@ class Covisibility:
         seen = seen.repeat_interleave(step, 0).repeat_interleave(step, 1)
         return seen[: camera.height, : camera.width, None]
 
-    def _seen(self, camera: Camera, world: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+    def _seen(self, camera: Camera, world: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
         """Points of a view that training views see: the nearest first, each only what too few have seen before it."""
         left, count = torch.arange(len(world), device=world.device), world.new_zeros(len(world), dtype=torch.int32)
         away = np.linalg.norm(self._centres - positions([camera]), axis=1)
@@ -97,7 +97,7 @@ class Covisibility:
         return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
 
 
-def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
     pixels, z = camera.project(world)
     inside = camera.contains(pixels, z)
     size = pixels.new_tensor([camera.width, camera.height])

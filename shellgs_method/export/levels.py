@@ -42,7 +42,7 @@ class Level:
     """Gaussians, and the largest area in pixels that each covers of a training view."""
 
     splats: Splats
-    shown: Float[Tensor, "N"]
+    shown: Float[Tensor, " N"]
 
     @classmethod
     def whole(cls, run: TrainedRun, splats: Splats) -> Level:
@@ -98,7 +98,7 @@ class _Mixture:
     shown: Float64[np.ndarray, " N"]
 
     @classmethod
-    def of(cls, splats: Splats, shown: Float[Tensor, "N"]) -> _Mixture:
+    def of(cls, splats: Splats, shown: Float[Tensor, " N"]) -> _Mixture:
         axes = Rotation.from_quat(splats.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
         axes *= np.exp(splats.scales.double().numpy())[:, None]
         opacities = splats.opacities.double().sigmoid()[:, 0].numpy()

@@ -290,7 +290,7 @@ class TrainedRun:
         return splats if self.cell is None else splats[self.in_core]
 
     @property
-    def in_core(self) -> Bool[Tensor, "N"]:
+    def in_core(self) -> Bool[Tensor, " N"]:
         """Which Gaussians of the model :meth:`splats` has: those of the core of a block's run, or all."""
         means = self.model.means.detach().cpu().double().numpy()
         if self.cell is None:

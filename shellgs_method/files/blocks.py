@@ -49,7 +49,7 @@ class Cut:
     offset: float
     """Distance of the plane from the origin along its normal."""
 
-    def distances(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N"]:
+    def distances(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
         """Signed distances of points."""
         return np.asarray(points, dtype=np.float64) @ np.array(self.normal) - self.offset
 
@@ -109,14 +109,14 @@ class Cell:
         sides = [(*cut.normal, cut.offset, above) for cut, above in self.sides]
         return fingerprint(self.block.name, sorted(self.block.photographs), self.overlap, sides)
 
-    def core(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
+    def core(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
         """Which points lie in the core, which each point does in one block."""
         inside = np.ones(len(points), bool)
         for cut, above in self.sides:
             inside &= (cut.distances(points) >= 0) == above
         return inside
 
-    def extended(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
+    def extended(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
         """Which points lie in the core or within the overlap of it."""
         inside = np.ones(len(points), bool)
         for cut, above in self.sides:

@@ -18,11 +18,11 @@ BARELY = 0.001
 HARDLY = 0.5
 """Area in pixels below which, in every training view, a Gaussian is hardly shown."""
 
-Coverage = Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
+Coverage = Callable[[Camera], tuple[Float[Tensor, " N"], Bool[Tensor, " N"]]]
 """Area in pixels that each Gaussian covers of a camera's view, and whether it reaches into the view."""
 
 
-def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
+def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, " N"]:
     """Gaussians with a parameter that is not finite."""
     means = gaussians["means"]
     if all(bool(parameter.detach().sum().isfinite()) for parameter in gaussians.values()):  # reads each once
@@ -31,7 +31,7 @@ def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
     return ~torch.stack(finite).all(dim=0)
 
 
-def contributions(cameras: Iterable[Camera], coverage: Coverage) -> Float[Tensor, "N"]:
+def contributions(cameras: Iterable[Camera], coverage: Coverage) -> Float[Tensor, " N"]:
     """Largest area in pixels that each Gaussian covers of a training view, by the sum of compositing weights.
 
     As in RadSplat (Niemeyer et al. 2024), which takes the largest contribution to a pixel.
@@ -43,14 +43,14 @@ def contributions(cameras: Iterable[Camera], coverage: Coverage) -> Float[Tensor
     return reduce(torch.maximum, (coverage(camera)[0] for camera in cameras))
 
 
-def hardly_shown(cameras: Iterable[Camera], coverage: Coverage) -> Bool[Tensor, "N"]:
+def hardly_shown(cameras: Iterable[Camera], coverage: Coverage) -> Bool[Tensor, " N"]:
     """Gaussians that contribute less than :data:`HARDLY` to every training view, see :func:`contributions`."""
     return contributions(cameras, coverage) < HARDLY
 
 
 def unshaped(
     means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], cameras: Iterable[Camera], coverage: Coverage
-) -> Bool[Tensor, "N"]:
+) -> Bool[Tensor, " N"]:
     """Gaussians that training views have not shaped, and that may spoil others.
 
     No view shows them; or views show little of them, though they reach a camera: the edge of something wide. A single

@@ -40,21 +40,21 @@ class Region:
         """The region of a cell in a scene with these SfM points."""
         return cls(cell, centre, FAR * skybox_radius(centre, sfm_points))
 
-    def core(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+    def core(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """Which centres belong to the block once all are merged."""
         points = _numpy(means)
         return torch.from_numpy(self.cell.core(points) & self._near(points)).to(means.device)
 
-    def extended(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+    def extended(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """Which centres are trained in the block."""
         points = _numpy(means)
         return torch.from_numpy(self.cell.extended(points) & self._near(points)).to(means.device)
 
-    def near(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+    def near(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """Which centres belong to any block, and not to what is far."""
         return torch.from_numpy(self._near(_numpy(means))).to(means.device)
 
-    def _near(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
+    def _near(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
         return np.linalg.norm(points - self.centre, axis=1) < self.far
 
     def shown(self, view: SeededView) -> SeededView:

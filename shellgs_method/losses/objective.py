@@ -183,7 +183,7 @@ class Objective:
                 losses |= view.cue(geometry, progress)
         return losses
 
-    def of_shapes(self, log_scales: Float[Tensor, "N 3"], radii: Int[Tensor, "N"]) -> dict[str, Tensor]:
+    def of_shapes(self, log_scales: Float[Tensor, "N 3"], radii: Int[Tensor, " N"]) -> dict[str, Tensor]:
         """Weighted terms of the Gaussians' shapes in the rescaled world, over those with a radius in a view."""
         weight = self.extra.flattening
         return {"flattening": weight * flattening_loss(log_scales.exp(), radii > 0)} if weight > 0 else {}

@@ -33,6 +33,6 @@ def _disagreement(normal: Vector, depth_normal: Vector, alpha: Vector, weight: V
     return [[weight[0] * (1 - alpha[0] * dot(normal, depth_normal))]]
 
 
-def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:
+def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, " N"]) -> Float[Tensor, ""]:
     """Mean of the visible Gaussians' smallest standard deviations, in the units of the scales."""
     return weighted_mean(scales.amin(dim=-1), visible)

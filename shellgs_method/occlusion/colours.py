@@ -41,7 +41,7 @@ def _bins(image: UInt8[Tensor, "h w 3"]) -> Int64[Tensor, "h w"]:
     return (red * _BINS + green) * _BINS + blue
 
 
-def _likelihood(counts: Float[Tensor, "bins"]) -> Float[Tensor, "bins"]:
+def _likelihood(counts: Float[Tensor, " bins"]) -> Float[Tensor, " bins"]:
     """Share of each bin, blurred, and above 0."""
     shares = (counts / counts.sum().clamp_min(1)).reshape(3 * (_BINS,)).numpy()
     return torch.from_numpy(gaussian_filter(shares, _BLUR)).flatten() + 1e-7

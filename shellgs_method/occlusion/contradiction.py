@@ -362,7 +362,7 @@ class _Neighbour:
         return grid_sample(self._there[None], grid, padding_mode="border", align_corners=False)[0]
 
 
-def _difference(there: Float[Tensor, "5 *N"], here: Float[Tensor, "5 *N"]) -> Float[Tensor, "*N"]:
+def _difference(there: Float[Tensor, " 5 *N"], here: Float[Tensor, " 5 *N"]) -> Float[Tensor, "*N"]:
     red, green, blue, across, down = (there - here).abs_()  # in place: it is most of a sweep's time
     return (red.add_(green).add_(blue)).clamp_max_(0.5).add_(across.add_(down).clamp_max_(0.5))
 

@@ -266,7 +266,7 @@ def _ignored(points: SparsePoints, photographs: Sequence[Shown]) -> float:
     return 1 - float(known.mean()) if len(known) >= _OBSERVATIONS else 0.0
 
 
-def _at(pixels: Float64[np.ndarray, "N 2"], image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, "N *C"]:
+def _at(pixels: Float64[np.ndarray, "N 2"], image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, " N *C"]:
     columns, rows = pixels.astype(int).T
     return image[rows, columns]
 

@@ -117,7 +117,7 @@ class ViewRenderer:
 
     def coverage(
         self, gaussians: Gaussians, camera: Camera, geometry: bool
-    ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+    ) -> tuple[Float[Tensor, " N"], Bool[Tensor, " N"]]:
         """Area of a view that each Gaussian covers, and whether it reaches into the view, occluded or not.
 
         The area is the sum of its compositing weights over the pixels. ``geometry`` is as in training.

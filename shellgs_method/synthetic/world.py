@@ -73,7 +73,7 @@ class World(Triangles):
         self.places = [*places] or [Place() for _ in parts]
         mesh = merge(moved(part, place.motion) for part, place in zip(parts, self.places, strict=True))
         super().__init__(mesh.vertices, mesh.triangles)
-        self.material: UInt8[np.ndarray, "F+1"] = np.append(mesh.material, 255).astype(np.uint8)
+        self.material: UInt8[np.ndarray, " F+1"] = np.append(mesh.material, 255).astype(np.uint8)
         self.part: Int[np.ndarray, " F"] = np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts])
 
     def frames(self, triangles: Int[np.ndarray, " N"]) -> Frames:

@@ -36,9 +36,9 @@ class Bins:
 
     width: int
     height: int
-    splats: Int[Tensor, "entries+1"]
-    starts: Int[Tensor, "tiles+1"]
-    counts: Int[Tensor, "tiles+1"]
+    splats: Int[Tensor, " entries+1"]
+    starts: Int[Tensor, " tiles+1"]
+    counts: Int[Tensor, " tiles+1"]
 
     @property
     def rows(self) -> int:
@@ -81,7 +81,7 @@ def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bin
     return Bins(width, height, splats, counts.cumsum(0) - counts, counts)
 
 
-def stable_order(keys: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+def stable_order(keys: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     """Indices that sort non-negative integers, stably."""
     if keys.device.type == "cpu" and len(keys) < 1 << 15:
         # torch uses radix sort only from this length; below it, numpy's, 16 bits at a time, takes a tenth of the time.
@@ -136,7 +136,7 @@ def _tiles_between(low: Value, high: Value, n_pixels: Value) -> tuple[Value, Val
     return first_tile, torch.where(last >= first, last_tile - first_tile + 1, 0.0)
 
 
-def count_up(first: Int[Tensor, "n"], times: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+def count_up(first: Int[Tensor, " n"], times: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """Repeat each index ``times`` times, and number the repetitions from ``first``."""
     item = torch.repeat_interleave(times)
     start = first - (times.cumsum(0, dtype=torch.int32) - times)

@@ -34,7 +34,12 @@ MAX_STRIPS = 16  # strips of one tile
 
 
 def composite(
-    view: View, features: Float[Tensor, "N C"], order: Int[Tensor, "n"], bins: Bins, kernels: Kernels, n_densifying: int
+    view: View,
+    features: Float[Tensor, "N C"],
+    order: Int[Tensor, " n"],
+    bins: Bins,
+    kernels: Kernels,
+    n_densifying: int,
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
@@ -232,7 +237,7 @@ class _Tiles:
         return torch.where(transmittance > 0, done.plan.strips.sum_behind(received) / transmittance, 0.0)
 
 
-def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, "n"], n_splats: int) -> Float[Tensor, "n_splats K"]:
+def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, " n"], n_splats: int) -> Float[Tensor, "n_splats K"]:
     """Sum the rows of each splat; several times faster than a scatter."""
     ends = torch.bincount(splats, minlength=n_splats).cumsum(0)
     return F.embedding_bag(stable_order(splats), rows, F.pad(ends[:-1], (1, 0)), mode="sum")

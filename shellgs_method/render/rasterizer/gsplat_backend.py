@@ -119,11 +119,11 @@ def rasterize_2d(
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
 
 
-def _of_each(cameras: Sequence[Camera], of_splats: Float[Tensor, "N *k"]) -> Float[Tensor, "B N *k"]:
+def _of_each(cameras: Sequence[Camera], of_splats: Float[Tensor, " N *k"]) -> Float[Tensor, "B N *k"]:
     return of_splats[None].expand(len(cameras), *of_splats.shape)
 
 
-def _of_view(of_views: Float[Tensor, "B *k"], i: int) -> Float[Tensor, "1 *k"]:
+def _of_view(of_views: Float[Tensor, " B *k"], i: int) -> Float[Tensor, " 1 *k"]:
     return of_views if len(of_views) == 1 else of_views[i, None]  # the gradient of which would be a copy
 
 
@@ -136,7 +136,7 @@ def _extents(
     means2d: Float[Tensor, "B N 2"],
     conics: Float[Tensor, "B N 3"],
     radii: Int[Tensor, "B N ..."],
-    opacities: Float[Tensor, "N"],
+    opacities: Float[Tensor, " N"],
     width: int,
     height: int,
 ) -> tuple[Float[Tensor, "B N ..."], Int[Tensor, "B N"]]:
@@ -434,7 +434,7 @@ def _bin(
     depths: Float[Tensor, "B N"],
     width: int,
     height: int,
-) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, "entries"]]:
+) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, " entries"]]:
     """Bin splats to tiles, front to back: offset of each tile in the list of splats, and the list."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     _, tiles, splats = isect_tiles(means2d, radii.int(), depths, TILE, columns, rows)

@@ -27,14 +27,14 @@ class Strips:
         ranks: number of strips of this tile in front of it.
     """
 
-    tiles: Int[Tensor, "n"]
-    starts: Int[Tensor, "n"]
-    counts: Int[Tensor, "n"]
-    rows: Int[Tensor, "n"]
-    ranks: Int[Tensor, "n"]
+    tiles: Int[Tensor, " n"]
+    starts: Int[Tensor, " n"]
+    counts: Int[Tensor, " n"]
+    rows: Int[Tensor, " n"]
+    ranks: Int[Tensor, " n"]
 
     @classmethod
-    def whole(cls, tiles: Int[Tensor, "n"], bins: Bins) -> Strips:
+    def whole(cls, tiles: Int[Tensor, " n"], bins: Bins) -> Strips:
         """One strip for each tile."""
         rows = torch.arange(len(tiles), device=tiles.device)
         return cls(tiles, bins.starts[tiles], bins.counts[tiles], rows, torch.zeros_like(rows))
@@ -71,7 +71,7 @@ class Strips:
         behind = F.pad(by_tile[:, 1:].flip(1).cumsum(1), (0, 0, 0, 0, 1, 0)).flip(1)
         return behind[self.rows, self.ranks]
 
-    def _by_tile(self, values: Float[Tensor, "n *shape"], fill: float) -> Float[Tensor, "tiles ranks *shape"]:
+    def _by_tile(self, values: Float[Tensor, " n *shape"], fill: float) -> Float[Tensor, "tiles ranks *shape"]:
         size = int(self.rows.max()) + 1, int(self.ranks.max()) + 1
         by_tile = values.new_full((*size, *values.shape[1:]), fill)
         by_tile[self.rows, self.ranks] = values

@@ -59,9 +59,9 @@ class View(NamedTuple):
 
     means2d: Float[Tensor, "N 2"]
     shapes: Float[Tensor, "N K"]
-    depths: Float[Tensor, "N"]
+    depths: Float[Tensor, " N"]
     outlines: Float[Tensor, "N O 7"]
-    visible: Bool[Tensor, "N"]
+    visible: Bool[Tensor, " N"]
     probed: Float[Tensor, "N 2+k"] | None
 
 

@@ -15,7 +15,7 @@ class Ellipsoids(NamedTuple):
     means: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
     scales: Float[Tensor, "N 3"]
-    opacities: Float[Tensor, "N"]
+    opacities: Float[Tensor, " N"]
 
 
 @dataclass(frozen=True)

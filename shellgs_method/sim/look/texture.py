@@ -183,7 +183,7 @@ class _Texels(NamedTuple):
 
     def mean(
         self, of_corners: Float64[np.ndarray, "F 3 *C"], some: Int64[np.ndarray, " M"] | slice
-    ) -> Float64[np.ndarray, "M *C"]:
+    ) -> Float64[np.ndarray, " M *C"]:
         """Values of the triangles' corners, interpolated at some texels."""
         return np.einsum("nk,nk...->n...", self.barycentric[some], of_corners[self.triangle[some]])
 
