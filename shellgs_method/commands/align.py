@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import tyro
 
-from shellgs_method.bounds import Length, bounded
+from shellgs_method.bounds import Length, check_bounds
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, better_start, console, table, warn
 from shellgs_method.errors import SceneError
 
@@ -29,130 +29,53 @@ class RefusedError(SceneError):
     """The validation refuses the alignment, and the report shows why."""
 
 
-@bounded
-def align(
-    scene: Scene,
+@dataclass(frozen=True)
+class AlignConfig:
+    """Settings of an alignment."""
+
     shell: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]", help_behavior_hint="")
-    ] = (),
-    matrix: Optional[Path] = None,
-    picks: Optional[Path] = None,
-    positions: Optional[Path] = None,
-    refine: Optional[Length] = None,
-    bundle_adjust: bool = False,
-    accept: bool = False,
-    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    metres_per_shell_unit: Optional[Length] = None,
-    same_frame: bool = False,
-    crs: Optional[str] = None,
-    mesher: Optional[Mesher] = None,
-    spacing: Optional[Length] = None,
-    paths: Paths = PATHS,
-) -> None:
-    """Align the shell to the scene, validate the result, and write scene/shell/alignment.json unless it is refused.
+    ] = ()
+    """Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates."""
+    matrix: Optional[Path] = None
+    """File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy)."""
+    picks: Optional[Path] = None
+    """Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name."""
+    positions: Optional[Path] = None
+    """Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates."""
+    refine: Optional[Length] = None
+    """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
+    bundle_adjust: bool = False
+    """Then adjust the cameras to the shell, to correct bending, if the alignment is not refused.
+    They are written to colmap/adjusted, which is used from then on.
+    Without this option, or with --colmap-path, the original cameras are used."""
+    accept: bool = False
+    """Accept the earlier proposal."""
+    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """CloudCompare's global shift, with --matrix."""
+    metres_per_shell_unit: Optional[Length] = None
+    """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
+    same_frame: bool = False
+    """Shell and cameras are in one frame and unit, as from a project of Metashape, RealityScan or OpenDroneMap."""
+    crs: Optional[str] = None
+    """Coordinate reference system of the shell, such as EPSG:25832.
+    Picks and positions whose first line names another one, such as EPSG:4326 for degrees, are converted.
+    If not set: as the shell's file says, or a .prj beside it, else that in which the same files were aligned before."""
+    mesher: Optional[Mesher] = None
+    """How a point cloud is meshed, here and wherever the alignment is used:
+    planes (ball pivoting between them), bpa (ball pivoting alone) or poisson (for round shapes).
+    If not set: that of the existing alignment, else planes."""
+    spacing: Optional[Length] = None
+    """Size in metres of the voxels in which a cloud's points are merged, here and wherever the alignment is used.
+    If not set: that of the existing alignment, else what the cameras resolve."""
 
-    The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix, --picks, --positions and --same-frame, an alignment is proposed, near the photographs'
-    geo-tags if the shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell,
-    the existing alignment is validated again, or refined.
-
-    Args:
-        scene: Scene folder.
-        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates.
-        matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
-        picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
-        positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
-        refine: Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres.
-        bundle_adjust: Then adjust the cameras to the shell, to correct bending, if the alignment is not refused. They
-            are written to colmap/adjusted, which is used from then on; without this option, or with --colmap-path, the
-            original cameras are used.
-        accept: Accept the earlier proposal.
-        global_shift: CloudCompare's global shift, with --matrix.
-        metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference
-            system, else a metre.
-        same_frame: The shell is in the frame and unit of the cameras: both come from one project of Metashape,
-            RealityScan or OpenDroneMap.
-        crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
-            another one, such as EPSG:4326 for degrees, are converted. If not set: as the shell's file says, or a .prj
-            beside it, else that in which the same files were aligned before.
-        mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
-            them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
-            else planes.
-        spacing: Size in metres of the voxels in which the points of a cloud are merged, here and wherever the alignment
-            is used. If not set: that of the existing alignment, else what the cameras resolve.
-        paths: Paths of the scene's files.
-    """
-    from dataparsers.facade import read_views
-    from shellgs_method.files.atomic import recover_folder
-    from shellgs_method.files.photographs import some_small
-    from shellgs_method.files.scene import ADJUSTED
-    from shellgs_method.files.sparse_points import read_sparse_points
-    from shellgs_method.registration.align import PROPOSAL, REPORT, frame_of_matrix, misplaced, refined
-    from shellgs_method.registration.sfm_frame import check_points
-    from shellgs_method.shell import ALIGNMENT
-
-    start = _Start(
-        shell, matrix, picks, positions, same_frame, accept, global_shift, metres_per_shell_unit, crs, mesher, spacing
-    )
-    start.check()
-    recover_folder(scene / ADJUSTED)
-    layout = paths.of(scene)
-    if shell or accept or bundle_adjust:
-        layout = layout.unadjusted()
-    views, points = read_views(layout), read_sparse_points(layout)
-    check_points(points, views, some_small(views))
-    placement, mesh = start.place(scene, views, points)
-    misplacement = misplaced(placement, mesh, views, points)
-    is_adjusted = layout.colmap_folder() == ADJUSTED
-    if refine is not None:
-        _check_refinement(is_adjusted, misplacement)
-        placement = refined(placement, mesh, views, points, refine)
-    if placement.proposed and bundle_adjust:
-        raise SceneError(
-            "cameras are not adjusted to a proposal: look at it first, then --accept it with --bundle-adjust"
-        )
-    model = ADJUSTED.as_posix() if is_adjusted else ""
-    placement = replace(placement, alignment=replace(placement.alignment, model=model))
-    target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    placement, validation = _written(target, layout, views, points, placement, mesh, picks, bundle_adjust)
-    _show_alignment(scene, target, placement, validation)
-    if validation.verdict == "refused":
-        kept = f"{target} is unchanged" if target.exists() else "nothing is written"
-        why = f"{misplacement}; " if misplacement else ""
-        frame = frame_of_matrix(layout) if matrix else ""
-        advice = frame or better_start(
-            scene,
-            shell or placement.alignment.files(scene),
-            metres_per_shell_unit,
-            crs,
-            refined=bool(refine or misplacement or placement.proposed),
-            picked=bool(picks),
-        )
-        raise RefusedError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}; {advice}")
-
-
-@dataclass(frozen=True)
-class _Start:
-    """What the command says of where the shell is."""
-
-    shell: tuple[Path, ...]
-    matrix: Path | None
-    picks: Path | None
-    positions: Path | None
-    same_frame: bool
-    accept: bool
-    global_shift: tuple[float, float, float]
-    metres_per_shell_unit: float | None
-    crs: str | None
-    mesher: Mesher | None
-    spacing: float | None
-
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Refuse what contradicts itself.
 
         Raises:
             SceneError: says what to give.
         """
+        check_bounds(AlignConfig, vars(self))
         starts = [start for start in (self.matrix, self.picks, self.positions, self.same_frame) if start]
         if len(starts) > 1 or (starts and not self.shell) or (self.accept and (self.shell or starts)):
             raise SceneError(
@@ -210,6 +133,67 @@ class _Start:
         return by.place_by_guess(mesh, views, points, as_it_is)
 
 
+_ALIGN = AlignConfig()
+
+
+def align(scene: Scene, config: Annotated[AlignConfig, tyro.conf.arg(name="")] = _ALIGN, paths: Paths = PATHS) -> None:
+    """Align the shell to the scene, validate the result, and write scene/shell/alignment.json unless it is refused.
+
+    The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
+    verdict. Without --matrix, --picks, --positions and --same-frame, an alignment is proposed, near the photographs'
+    geo-tags if the shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell,
+    the existing alignment is validated again, or refined.
+
+    Args:
+        scene: Scene folder.
+        config: Settings.
+        paths: Paths of the scene's files.
+    """
+    from dataparsers.facade import read_views
+    from shellgs_method.files.atomic import recover_folder
+    from shellgs_method.files.photographs import some_small
+    from shellgs_method.files.scene import ADJUSTED
+    from shellgs_method.files.sparse_points import read_sparse_points
+    from shellgs_method.registration.align import PROPOSAL, REPORT, frame_of_matrix, misplaced, refined
+    from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.shell import ALIGNMENT
+
+    recover_folder(scene / ADJUSTED)
+    layout = paths.of(scene)
+    if config.shell or config.accept or config.bundle_adjust:
+        layout = layout.unadjusted()
+    views, points = read_views(layout), read_sparse_points(layout)
+    check_points(points, views, some_small(views))
+    placement, mesh = config.place(scene, views, points)
+    misplacement = misplaced(placement, mesh, views, points)
+    is_adjusted = layout.colmap_folder() == ADJUSTED
+    if config.refine is not None:
+        _check_refinement(is_adjusted, misplacement)
+        placement = refined(placement, mesh, views, points, config.refine)
+    if placement.proposed and config.bundle_adjust:
+        raise SceneError(
+            "cameras are not adjusted to a proposal: look at it first, then --accept it with --bundle-adjust"
+        )
+    model = ADJUSTED.as_posix() if is_adjusted else ""
+    placement = replace(placement, alignment=replace(placement.alignment, model=model))
+    target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
+    placement, validation = _written(target, layout, views, points, placement, mesh, config)
+    _show_alignment(scene, target, placement, validation)
+    if validation.verdict == "refused":
+        kept = f"{target} is unchanged" if target.exists() else "nothing is written"
+        why = f"{misplacement}; " if misplacement else ""
+        frame = frame_of_matrix(layout) if config.matrix else ""
+        advice = frame or better_start(
+            scene,
+            config.shell or placement.alignment.files(scene),
+            config.metres_per_shell_unit,
+            config.crs,
+            refined=bool(config.refine or misplacement or placement.proposed),
+            picked=bool(config.picks),
+        )
+        raise RefusedError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}; {advice}")
+
+
 def _check_refinement(is_adjusted: bool, misplacement: str | None) -> None:
     if is_adjusted:
         raise SceneError(
@@ -227,8 +211,7 @@ def _written(
     points: SparsePoints,
     placement: Placement,
     mesh: ShellMesh,
-    picks: Path | None,
-    bundle_adjust: bool,
+    config: AlignConfig,
 ) -> tuple[Placement, Validation]:
     """Validate a placement, with cameras adjusted to it if they shall be, and write both unless it is refused."""
     from dataparsers.facade import read_views
@@ -247,13 +230,13 @@ def _written(
     validation = validation.with_checks(placement.checks)
     candidate = unfinished(scene / ADJUSTED)
     try:
-        if bundle_adjust and validation.verdict != "refused":
+        if config.bundle_adjust and validation.verdict != "refused":
             placement, adjustment = unbent(placement, mesh, layout)
             if adjustment:
                 write_model(candidate, adjustment.model, adjustment.errors)
                 layout = replace(layout, colmap_path=candidate.relative_to(scene))
                 views, points = read_views(layout), read_sparse_points(layout)
-                placement = seen_again(placement, views, picks)
+                placement = seen_again(placement, views, config.picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
         bound = replace(validation, alignment=validation.alignment.bound(scene, views))

@@ -54,7 +54,7 @@ class Recipe:
 
     @property
     def starts(self) -> dict[str, Any]:
-        """What the alignment starts from, as arguments of :func:`align`; nothing for a proposal."""
+        """What the alignment starts from, as settings of :func:`align`; nothing for a proposal."""
         given = {name: getattr(self, name) for name in ("matrix", "picks", "positions", "same_frame")}
         return {name: value for name, value in given.items() if value}
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.commands.align import RefusedError, align
+from shellgs_method.commands.align import AlignConfig, RefusedError, align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
 from shellgs_method.commands.common import better_start, console, open_page, resumable
@@ -150,21 +150,15 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     remedy = better_start(scene, shell, unit, recipe.crs, refined=refined, picked=picked)
     try:
         if not done.has("align", key) or not _is_there(written, scene):
-            align(
-                scene,
-                shell,
-                **recipe.starts,
-                refine=recipe.refine,
-                bundle_adjust=recipe.bundle_adjust and not proposed,
-                metres_per_shell_unit=recipe.metres_per_shell_unit,
-                crs=recipe.crs,
-            )
+            adjust = recipe.bundle_adjust and not proposed
+            given = {"refine": recipe.refine, "metres_per_shell_unit": unit, "crs": recipe.crs}
+            align(scene, AlignConfig(shell, **recipe.starts, **given, bundle_adjust=adjust))
             if proposed:  # it is seen first
                 done.forget("accepted")
                 accept = accepted = False
             done.note("align", key)
         elif accept and proposed and not accepted:
-            align(scene, accept=True, bundle_adjust=recipe.bundle_adjust)
+            align(scene, AlignConfig(accept=True, bundle_adjust=recipe.bundle_adjust))
     except SceneError as error:
         if isinstance(error, RefusedError):
             open_page(report)

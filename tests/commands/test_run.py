@@ -77,9 +77,9 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
     photographs, shell, _ = inputs
     calls = []
 
-    def align(scene, shell=(), accept=False, **settings):
-        calls.append(accept)
-        path = scene / (ALIGNMENT if accept else PROPOSAL)
+    def align(scene, config):
+        calls.append(config.accept)
+        path = scene / (ALIGNMENT if config.accept else PROPOSAL)
         Alignment(np.eye(4), ("../shell.ply",), verdict="doubtful").save(path)
 
     monkeypatch.setattr(run_command, "align", align)
@@ -103,7 +103,7 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
 def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_accepted(inputs, shellgs, monkeypatch):
     photographs, shell, matrix = inputs
     calls, align = [], run_command.align
-    monkeypatch.setattr(run_command, "align", lambda *words, **settings: [calls.append(1), align(*words, **settings)])
+    monkeypatch.setattr(run_command, "align", lambda *words: [calls.append(1), align(*words)])
     assert "the alignment is doubtful" in shellgs("run", photographs, shell, "--matrix", matrix)
     assert Alignment.load(Path("scene") / ALIGNMENT).verdict == "doubtful"  # of a fixture so small
     assert "the alignment is doubtful" in shellgs("run")
@@ -121,8 +121,8 @@ def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_a
 def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs, shellgs, monkeypatch):
     photographs, shell, matrix = inputs
 
-    def align(scene, shell, matrix, metres_per_shell_unit, **settings):
-        doubted = {"verdict": "doubtful", "metrics": {LIKELIER: 0.3048}} if metres_per_shell_unit is None else {}
+    def align(scene, config):
+        doubted = {"verdict": "doubtful", "metrics": {LIKELIER: 0.3048}} if not config.metres_per_shell_unit else {}
         replace(scene_alignment(inputs), **{"verdict": "good", **doubted}).save(scene / ALIGNMENT)
 
     monkeypatch.setattr(run_command, "align", align)

@@ -14,7 +14,7 @@ from scenes import cast
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import read_views
-from shellgs_method.commands.align import align
+from shellgs_method.commands.align import AlignConfig, align
 from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import (
     KEYPOINT,
@@ -288,7 +288,7 @@ def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
 def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: ShellSurface, bent: Model):
     matrix = write(tmp_path, bent, building(Layout(5, 3)))
     files = {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()}
-    align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, refine=0.3, bundle_adjust=True)
+    align(tmp_path, AlignConfig((tmp_path / "shell.ply",), matrix=matrix, refine=0.3, bundle_adjust=True))
     assert Alignment.load(tmp_path / ALIGNMENT).model == ADJUSTED.as_posix()
     layout = ScenePaths().of(tmp_path)
     assert layout.colmap_folder() == ADJUSTED
@@ -308,7 +308,7 @@ def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: S
     assert {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()} == files
 
     with pytest.raises(SceneError, match="--refine would move the shell from where the cameras were adjusted to it"):
-        align(tmp_path, refine=0.1)
+        align(tmp_path, AlignConfig(refine=0.1))
     assert "Motion that would fit the points better" not in report
     alignment = Alignment.load(tmp_path / ALIGNMENT)
     cast(tmp_path, views[:1], alignment, max_image_size=64)
@@ -323,14 +323,14 @@ def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: S
 def test_a_scene_of_transforms_is_refused_in_a_sentence(scene: Path):
     before = (scene / ALIGNMENT).read_bytes()
     with pytest.raises(SceneError, match=r"transforms\.json has no tracks, which a COLMAP model has"):
-        align(scene, bundle_adjust=True)
+        align(scene, AlignConfig(bundle_adjust=True))
     assert (scene / ALIGNMENT).read_bytes() == before
     assert not (scene / ADJUSTED).exists()
 
 
 def test_the_command_leaves_straight_cameras_as_they_are(tmp_path: Path, model: Model):
     matrix = write(tmp_path, model, building(Layout(5, 3)))
-    align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True)
+    align(tmp_path, AlignConfig((tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True))
     assert "The cameras are left as they are" in (tmp_path / "shell/report/index.html").read_text()
     assert not (tmp_path / ADJUSTED).exists()
     assert ScenePaths().of(tmp_path).colmap_folder() == Path("colmap/sparse/0")
@@ -346,7 +346,7 @@ def test_a_wrong_shell_does_not_bend_good_cameras(tmp_path: Path, model: Model, 
     mesh = building(Layout(3, 5) if wrong == "another building" else Layout(5, 3))
     matrix = write(tmp_path, model, mesh, shift)
     with suppress(SceneError):  # or says that the cameras are left as they are
-        align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True)
+        align(tmp_path, AlignConfig((tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True))
     assert not (tmp_path / ADJUSTED).exists()
     assert ScenePaths().of(tmp_path).colmap_folder() == Path("colmap/sparse/0")
 
