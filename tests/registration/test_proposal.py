@@ -1,0 +1,259 @@
+"""Coarse registration: proposals of an alignment, with and without geo-tags, against the true one."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from alignments import AXES, TRUTH, degrees_of, displaced, error
+from PIL import ExifTags, Image
+from scenes import views_of
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.geometry.axes import turn
+from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.registration import proposal
+from shellgs_method.registration.align import PROPOSAL, place_by_guess
+from shellgs_method.registration.geotags import GeoTags
+from shellgs_method.registration.orientations import scene_axes, shell_axes
+from shellgs_method.registration.proposal import Candidate
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
+from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.synthetic.building import Layout, shell
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
+from shellgs_method.synthetic.geometry import merge
+from shellgs_method.synthetic.scene import FacadeConfig, write_scan, write_scene
+
+
+def unplaced(shell: str, crs: str = "") -> Alignment:
+    """An alignment of a file, but for its similarity."""
+    return Alignment(np.eye(4), (shell,), crs=crs)
+
+
+def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
+    placement = place_by_guess(mesh, views, points, unplaced("shell/facade.ply"))
+    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
+    assert placement.proposed
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
+def turned(axis: str) -> np.ndarray:
+    """The motion that turns the shell so that an axis of its file, or none, is up."""
+    if axis == "none":
+        return displaced(0.0, 50.0, 0.0, seed=7)
+    motion = np.eye(4)
+    motion[:3, :3] = turn(np.eye(3)[2], np.eye(3)["xyz".index(axis)])
+    return motion
+
+
+@pytest.mark.parametrize("axis", ["x", "none"])
+def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
+    motion = turned(axis)
+    askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
+    alignment = place_by_guess(askew, views, points, unplaced("shell/facade.ply")).alignment
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
+def tagged(folder: Path, views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[View]:
+    """The views with photographs that say where they were taken, metres off in UTM 32, by a bias along the facade."""
+    images = [folder / f"{Path(view.name).stem}.jpg" for view in views]
+    for image, exif in zip(images, geo_tags(views, noise, seed, bias), strict=True):
+        Image.new("RGB", (96, 64)).save(image, exif=exif)
+    return [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+
+
+def geo_tags(views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[Image.Exif]:
+    """EXIF data that say where photographs were taken, as :func:`tagged` writes them."""
+    places = transformed(np.stack([v.camera.position.double().numpy() for v in views]), np.linalg.inv(TRUTH))
+    places[:, :2] += np.random.default_rng(seed).normal(0, noise, (len(views), 2))
+    places += bias * AXES[:, 0]
+    tags = [Image.Exif() for _ in views]
+    for exif, (lon, lat, _) in zip(tags, degrees_of(places), strict=True):
+        exif[ExifTags.Base.Make] = "phone"  # Pillow writes none into a PNG that has GPS alone
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: minutes(lat), 3: "E", 4: minutes(lon), 6: 77.0})
+    return tags
+
+
+def minutes(degrees: float) -> tuple[float, float, float]:
+    whole = int(degrees)
+    return whole, int(60 * (degrees - whole)), 60 * ((60 * (degrees - whole)) % 1)
+
+
+def test_geo_tags_are_read_in_the_system_of_the_shell(tmp_path, views, surface, survey_from_scene):
+    tags = GeoTags.of(tagged(tmp_path, views, 0.0), "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    assert tags.apart(survey_from_scene) < 0.1  # seconds as fractions of whole numbers
+    assert GeoTags.of(views, "EPSG:25832", surface.survey_from_shell) is None
+    some = tagged(tmp_path, views, 0.0)[:3]
+    some[0].image.write_bytes(some[0].image.read_bytes()[:60])  # damaged
+    assert GeoTags.of(some, "EPSG:25832", surface.survey_from_shell) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        ({1: "north ", 3: "e"}, 10),
+        ({1: "", 3: "E"}, 9),
+        ({2: (0.0, 0.0, 0.0), 4: (99.0, 0.0, 0.0)}, 9),
+    ],
+)
+def test_a_geo_tag_that_cannot_be_used_is_left_out(tmp_path, views, surface, survey_from_scene, change, read):
+    shown = tagged(tmp_path, views, 0.0)
+    with Image.open(shown[4].image) as image:
+        exif = image.getexif()
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(change)
+    Image.new("RGB", (96, 64)).save(shown[4].image, exif=exif)
+    tags = GeoTags.of(shown, "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    assert len(tags.places) == read
+    assert tags.apart(survey_from_scene) < 0.1
+
+
+def twins_of(mesh: ShellMesh, metres: float) -> ShellMesh:
+    """The shell, and another so far to the right."""
+    beside = mesh.vertices + metres * AXES[:, 0]
+    return ShellMesh(np.concatenate([mesh.vertices, beside]), np.concatenate([mesh.faces, mesh.faces + len(beside)]))
+
+
+def test_geo_tags_with_a_bias_leave_a_building_and_its_neighbour_ambiguous(tmp_path, mesh, views, points):
+    apart = float(np.ptp(mesh.vertices @ AXES[:, 0])) + 0.2
+    shown = tagged(tmp_path, views, 1.0, bias=0.75 * apart)
+    placement = place_by_guess(twins_of(mesh, apart), shown, points, unplaced("s.ply", crs="EPSG:25832"))
+    assert any(f"Ambiguous: an alignment {apart:.1f} m from this one" in sentence for sentence in placement.history)
+
+
+def test_geo_tags_that_no_place_agrees_with_are_told(tmp_path, mesh, views, points):
+    """As of a building elsewhere, and of one in a model of a whole district, in which it is too small to be found."""
+    shown = tagged(tmp_path, views, 1.0, bias=60.0)
+    placement = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832"))
+    assert placement.history[1].endswith("crop a shell of a whole district to what photographs show.")
+
+
+def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
+    twins = twins_of(mesh, 40)
+    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, unplaced("s.ply", crs="EPSG:25832"))
+    assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
+    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m away from it\.", placement.history[1])
+    assert not any("Ambiguous" in sentence for sentence in placement.history)
+
+
+def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_path, shellgs):
+    """Of two facades that are the same, whose scan is in UTM 32."""
+    scene, scan = tmp_path / "scene", tmp_path / "twins.ply"
+    write_scene(scene, FacadeConfig(96, 64, 10, points=1500, supersampling=1, bays=3, storeys=2))
+    (scene / ALIGNMENT).unlink()
+    one = shell(Layout(3, 2))
+    write_scan(scan, merge([one, replace(one, vertices=one.vertices + np.array([40.0, 0, 0]))]))
+    views = views_of(scene)
+    for view, exif in zip(views, geo_tags(views, 3.0), strict=True):
+        Image.open(view.image).save(view.image, exif=exif)
+    told = shellgs("align", scene, scan, "--crs", "EPSG:25832")
+    assert re.search(r"10 photographs have geo-tags, in the median [1-6]\.\d m away from it\.", told), told
+    assert "Ambiguous" not in told  # as it is without them: the other facade scores 100 %
+    proposed = Alignment.load(scene / PROPOSAL)
+    there = transformed(one.vertices, SHELL_FROM_BUILDING)
+    assert np.abs(proposed.apply(there) - transformed(there, TRUTH)).max() < 0.1
+
+
+@pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
+def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
+    motion = turned(axis)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",), cameras=BoundCameras.of(views))
+    assert alignment.up is not None
+    cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
+    assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
+    path = tmp_path / "alignment.json"
+    alignment.save(path)
+    assert Alignment.load(path) == alignment
+    older = json.loads(path.read_text())
+    del older["up"]
+    path.write_text(json.dumps(older))
+    up = Alignment.load(path).up
+    assert up is not None
+    np.testing.assert_array_equal(up, alignment.up)
+
+
+def test_the_main_wall_is_the_same_in_each_run():
+    """Of a wall as rough as Open3D's segment_plane finds another plane in each of ten runs or so."""
+    random = np.random.default_rng(0)
+    wall = np.stack([random.uniform(0, 20, 3000), random.normal(0, 0.25, 3000), random.uniform(0, 8, 3000)], axis=1)
+    ground = np.stack([random.uniform(0, 20, 2500), random.uniform(-9, 0, 2500), random.normal(0, 0.02, 2500)], axis=1)
+    cameras, up = np.array([[5.0, -10, 2], [15, -10, 2]]), np.array([0.0, 0, 1])
+    found = [scene_axes(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
+    assert len({axes.tobytes() for axes in found}) == 1
+    assert np.degrees(np.arccos(-found[0][2, 1])) < 1
+
+
+@pytest.mark.parametrize("first", [0.0, 20.0])
+def test_the_walls_of_both_wings_of_a_bent_building_are_tried(first: float):
+    """The larger wing's normals scatter over the neighbouring degrees too, and around 0° over those below 90°."""
+    random = np.random.default_rng(0)
+    headings = np.radians(random.normal(np.repeat([first, first + 30], [6000, 4000]), 1.5))
+    walls = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=1)
+    normals = np.concatenate([walls, np.tile([0.0, 0, 1], (2000, 1))])
+    out = np.array([axes[2] for axes in shell_axes(normals) if axes[1, 2] > 0.99])
+    for wing in np.radians([first, first + 30]):
+        assert np.degrees(np.arccos((out @ [np.cos(wing), np.sin(wing), 0]).clip(-1, 1).max())) < 0.9
+
+
+def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
+    """As a shell in millimetres gives, if taken for one in metres."""
+    unsupported = [Candidate(np.eye(4), score=0.0)]
+    monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
+    monkeypatch.setattr(proposal._Fit, "refined", lambda *_: unsupported)
+    with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
+        place_by_guess(mesh, views, points, unplaced("shell/facade.glb"))
+
+
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_a_proposal_needs_points(mesh, views, points, count):
+    with pytest.raises(SceneError, match="no upright wall to start from: pick points"):
+        place_by_guess(mesh, views, SparsePoints(points.positions[:count]), unplaced("facade.glb"))
+
+
+def test_a_flat_wall_is_searched_for_in_about_its_size(views):
+    random = np.random.default_rng(0)
+    corners = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 9], [0, 0, 9]])
+    samples, _ = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))).samples(2000)
+    seen = samples + random.normal(0, 0.01, samples.shape)
+    sight: Any = SimpleNamespace(points=seen, origins=seen - [0.0, 8.0, 0.0])
+    found = proposal._Search.of(samples, seen, sight).placed(np.eye(3))
+    best = max(found, key=lambda candidate: candidate.score).survey_from_scene
+    np.testing.assert_allclose(best[:3, :3], np.eye(3), atol=0.1)
+    np.testing.assert_allclose(best[:3, 3], 0, atol=0.5)
+
+
+def test_points_exactly_in_a_plane_are_placed_on_a_shell_with_depth(mesh):
+    samples, _ = ShellSurface(mesh).samples(5000)
+    wall = samples[np.abs(samples[:, 1] - np.median(samples[:, 1])) < 0.1] * [1, 0, 1] / 3
+    sight: Any = SimpleNamespace(points=wall, origins=wall - [0.0, 3.0, 0.0])
+    found = list(proposal._Search.of(samples, wall, sight).placed(np.eye(3)))
+    assert min(abs(scale_of(candidate.survey_from_scene) / 3 - 1) for candidate in found) < 0.03
+    assert len(found) < 3 * 150
+
+
+def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
+    layout = Layout(5, 3)
+    openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
+    random = np.random.default_rng(0)
+    # Window edges of bays 1 and 3 only, on both sides of the door, and the wall between them.
+    corners = [(x, -0.0, z) for x0, x1, z0, z1 in openings for x in (x0, x1) for z in (z0, z1) if 3 < x0 < 12]
+    wall = random.uniform([3.0, 0, 0.3], [12.0, 0, 9.5], (1500, 3))
+    inside = np.zeros(len(wall), bool)
+    for x0, x1, z0, z1 in openings:
+        inside |= (wall[:, 0] > x0) & (wall[:, 0] < x1) & (wall[:, 2] > z0) & (wall[:, 2] < z1)
+    building = np.concatenate([wall[~inside], np.repeat(np.array(corners), 10, axis=0)])
+    building += random.normal(0, 0.01, building.shape)
+    points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
+    history = place_by_guess(mesh, views, points, unplaced("shell/facade.ply")).history
+    assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)

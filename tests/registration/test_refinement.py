@@ -1,0 +1,104 @@
+"""Similarities and refinement: known displacements, and points that must be refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from alignments import TRUTH, displaced, error, shifted
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.geometry.precision import mesh_step
+from shellgs_method.geometry.similarity import fit_similarity, transformed
+from shellgs_method.registration.align import Placement, refined
+from shellgs_method.registration.refinement import refine
+from shellgs_method.registration.validation import validate
+from shellgs_method.shell import Alignment, ShellMesh
+from shellgs_method.shell.surface import ShellSurface
+
+
+def in_its_own_frame(points: SparsePoints) -> tuple[Placement, np.ndarray]:
+    """A scene in the shell's national coordinates: the exact placement, and the SfM points."""
+    return Placement(Alignment(np.eye(4), ("facade.ply",))), transformed(points.positions, np.linalg.inv(TRUTH))
+
+
+def test_refinement_does_not_follow_points_in_single_precision(mesh, views, points):
+    placement, exact = in_its_own_frame(points)
+    rounded = SparsePoints(exact.astype(np.float32).astype(np.float64))
+    with pytest.raises(
+        SceneError, match=r"--refine .* the SfM points are stored in steps of 0\.031 x 0\.5 x 1\.5e-05 m"
+    ):
+        refined(placement, mesh, views, rounded, 0.3)
+    assert "Refined" in refined(placement, mesh, views, SparsePoints(exact), 0.3).history[-1]
+
+
+def test_points_beyond_the_last_gate_by_rounding_count(surface, points, survey_from_scene):
+    exact = refine(surface, points.positions, survey_from_scene, 0.1).evidence.points
+    assert refine(surface, points.positions, survey_from_scene, 0.1, rounding=0.02).evidence.points > exact
+
+
+def test_decimetres_of_a_shell_are_never_good(mesh, views, points):
+    vertices = mesh.vertices.round(1)
+    rounded = replace(mesh, vertices=vertices, step=mesh_step(vertices, mesh.faces))
+    validation = validate(rounded, shifted(), views, points)
+    assert any("Steps of the coordinates of shell/facade.ply: 0.1 x 0.1" in reason for reason in validation.reasons)
+    assert (validation.metrics()["rounding_m"] or 0.0) >= 0.05
+
+
+def test_an_alignment_is_refused_if_its_cameras_were_rounded_to_metres(mesh, views, points):
+    placement, exact = in_its_own_frame(points)
+    moved = []
+    for view in views:
+        viewmat = view.camera.viewmat @ torch.from_numpy(TRUTH)
+        viewmat[:3] /= np.cbrt(np.linalg.det(TRUTH[:3, :3]))
+        viewmat[:3, 3] = viewmat[:3, 3].float().double()
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    validation = validate(mesh, placement.alignment, moved, SparsePoints(exact))
+    assert validation.verdict == "refused"
+    assert validation.reasons[0].startswith("Steps of the cameras: 0.")
+
+
+def test_a_similarity_is_found_from_exact_points():
+    random = np.random.default_rng(0)
+    points = random.normal(size=(4, 3))
+    truth = displaced(3.0, 70.0, 1.5, seed=3)
+    np.testing.assert_allclose(fit_similarity(points, transformed(points, truth)), truth, atol=1e-12)
+
+
+def test_mirrored_points_give_no_mirroring():
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
+
+
+@pytest.mark.parametrize("growth", [-0.01, 0.01])
+def test_refinement_returns_from_30_cm_1_degree_and_1_percent(surface, points, survey_from_scene, growth):
+    start = displaced(0.3, 1.0, growth, seed=5) @ survey_from_scene
+    assert error(surface, start, survey_from_scene) > 0.25
+    found = refine(surface, points.positions, start, reach=1.0)
+    assert error(surface, found.survey_from_scene, survey_from_scene) < 0.006  # 1.5 cm of noise in 1500 points
+    assert not found.evidence.weak.any()
+
+
+def test_a_bare_wall_determines_three_directions_and_leaves_the_other_four_unchanged():
+    corners = np.array([[-8.0, 0, -4], [8, 0, -4], [8, 0, 4], [-8, 0, 4]])
+    surface = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+    random = np.random.default_rng(0)
+    points = random.uniform([-6, 0, -3], [6, 0, 3], (500, 3)) + random.normal(0, 0.01, (500, 1)) * [0, 1, 0]
+    # 20 cm along the wall, which the points do not determine, and 10 cm out of it, which they do.
+    start = np.eye(4)
+    start[:3, 3] = [0.2, 0.1, 0.0]
+    found = refine(surface, points, start, reach=0.5)
+    assert found.evidence.weak.sum() == 4
+    np.testing.assert_allclose(found.survey_from_scene[:3, 3], [0.2, 0, 0], atol=0.005)
+    assert np.cbrt(np.linalg.det(found.survey_from_scene[:3, :3])) == pytest.approx(1, abs=1e-4)
+    words = " ".join(found.evidence.in_words(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])))
+    assert all(word in words for word in ("along the facade", "upwards", "roll", "scale"))
+    assert all(word not in words for word in ("out of the facade", "tilt", "turn"))
+
+
+def test_points_of_something_else_are_refused(surface, survey_from_scene):
+    with pytest.raises(SceneError, match="only 0 SfM points are within 1 m"):
+        refine(surface, np.full((50, 3), 1000.0), survey_from_scene, reach=1.0)
