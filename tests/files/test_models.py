@@ -58,6 +58,18 @@ def test_each_geometry_of_a_cityjson_is_cast_to_a_millimetre(tmp_path: Path, kin
     assert_cast_as(path, moved(house()))
 
 
+@pytest.mark.parametrize("kind", ["Solid", "MultiSolid"])
+def test_a_hollow_in_a_solid_of_a_cityjson_is_left_out(tmp_path: Path, caplog, kind: str):
+    document = made.cityjson(house(), kind)
+    whole = read_geometry(made.save_json(tmp_path / "a.json", document))
+    (geometry,) = document["CityObjects"]["a"]["geometry"]
+    shells = geometry["boundaries"] if kind == "Solid" else geometry["boundaries"][0]
+    shells.append([[[len(document["vertices"]) + k for k in range(3)]]])
+    document["vertices"] += [[1000, 1000, 1000], [2000, 1000, 1000], [1000, 2000, 1000]]
+    assert len(read_geometry(made.save_json(tmp_path / "b.json", document)).faces) == len(whole.faces)
+    assert "1 hollow in a solid" in caplog.text
+
+
 def as_instance(faces: Sequence[Face]) -> dict[str, Any]:
     """The house as a template, turned by 90 degrees and moved."""
     document = made.cityjson(faces)
@@ -282,6 +294,16 @@ def test_a_solid_that_links_to_the_surfaces_adds_nothing(tmp_path: Path):
     alone = read_geometry(save(tmp_path / "b.gml", made.citygml("".join(surfaces))))
     assert SurfaceClass.OTHER not in read.classes
     assert len(read.faces) == len(alone.faces)
+
+
+def test_a_hollow_in_a_solid_of_a_citygml_is_left_out(tmp_path: Path, caplog):
+    member = "<gml:CompositeSurface><gml:surfaceMember>{}</gml:surfaceMember></gml:CompositeSurface>"
+    outer, inner = (member.format(made.polygon_gml(face.rings)) for face in moved(house())[:2])
+    solid = "<bldg:lod3Solid><gml:Solid><gml:exterior>{}</gml:exterior>{}</gml:Solid></bldg:lod3Solid>"
+    whole, hollow = solid.format(outer, ""), solid.format(outer, f"<gml:interior>{inner}</gml:interior>")
+    read = [read_geometry(save(tmp_path / "a.gml", made.citygml(text))) for text in (whole, hollow)]
+    assert len(read[0].faces) == len(read[1].faces)
+    assert "1 hollow in a solid" in caplog.text
 
 
 def test_a_link_to_nothing_and_one_to_itself_end_in_words(tmp_path: Path, caplog):

@@ -37,6 +37,8 @@ _OPENINGS = ("Window", "WindowSurface", "Door", "DoorSurface")
 _INSIDE = ("InteriorWallSurface", "CeilingSurface", "FloorSurface")
 _NOTHING = "ClosureSurface"
 """A surface that is not there: it closes what is open."""
+HOLLOW = "hollow in a solid"
+"""An inner shell of one, in words."""
 _TERRAIN = "TINRelief"
 _WHOLES = ("Building", "Bridge", "Tunnel")
 _PARTS = ("", "Part", "Installation", "ConstructiveElement", "ConstructionElement")

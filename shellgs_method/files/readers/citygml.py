@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.crs_of_files import metres_of_degrees
-from shellgs_method.files.readers.city import CityObject, Polygon, is_surface, outside, ring_of
+from shellgs_method.files.readers.city import HOLLOW, CityObject, Polygon, is_surface, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry, numbers_in
 from shellgs_method.geometry.similarity import transformed
 
@@ -173,6 +173,8 @@ class _Model:
         elif element.get(_HREF) is not None:
             if (target := self.linked(element)) is not None:
                 yield from self._polygons(target, depth + 1)
+        elif name == "interior":  # of a solid: those of polygons are rings
+            self.missing[HOLLOW] += 1
         else:
             for child in element:
                 yield from self._polygons(child, depth + 1)

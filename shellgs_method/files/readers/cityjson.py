@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.readers.city import CityObject, Polygon, outside, ring_of
+from shellgs_method.files.readers.city import HOLLOW, CityObject, Polygon, outside, ring_of
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.geometry.similarity import transformed
 
@@ -142,22 +142,23 @@ class _Document:
             return
         semantics = geometry.get("semantics") or {}
         surfaces, values = semantics.get("surfaces", []), semantics.get("values")
-        yield from _flattened(geometry["boundaries"], values, _DEPTHS[kind], vertices, surfaces)
+        yield from self._flattened(geometry["boundaries"], values, _DEPTHS[kind], vertices, surfaces)
 
-
-def _flattened(
-    boundaries: list, values: list | None, depth: int, vertices: np.ndarray, surfaces: list[dict[str, Any]]
-) -> Iterator[Polygon]:
-    """The polygons of nested lists, with the types of their surfaces, whose indices are nested alike."""
-    for k, boundary in enumerate(boundaries):
-        value = values[k] if values is not None and k < len(values) else None
-        if depth:
-            yield from _flattened(boundary, value, depth - 1, vertices, surfaces)
-        elif boundary:
-            surface = ""  # also of a number of none, as -1, which programs write
-            if isinstance(value, int) and 0 <= value < len(surfaces):
-                surface = str(surfaces[value]["type"]).lstrip("+")
-            yield Polygon([ring_of(_at(vertices, ring)) for ring in boundary], surface)
+    def _flattened(
+        self, boundaries: list, values: list | None, depth: int, vertices: np.ndarray, surfaces: list[dict[str, Any]]
+    ) -> Iterator[Polygon]:
+        """The polygons of nested lists, with the types of their surfaces, whose indices are nested alike."""
+        for k, boundary in enumerate(boundaries):
+            value = values[k] if values is not None and k < len(values) else None
+            if depth == 1 and k:  # the first shell of a solid is its outside
+                self.missing[HOLLOW] += 1
+            elif depth:
+                yield from self._flattened(boundary, value, depth - 1, vertices, surfaces)
+            elif boundary:
+                surface = ""  # also of a number of none, as -1, which programs write
+                if isinstance(value, int) and 0 <= value < len(surfaces):
+                    surface = str(surfaces[value]["type"]).lstrip("+")
+                yield Polygon([ring_of(_at(vertices, ring)) for ring in boundary], surface)
 
 
 def _at(vertices: Float64[np.ndarray, "V 3"], indices: list[int]) -> Float64[np.ndarray, "N 3"]:
