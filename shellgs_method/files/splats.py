@@ -196,7 +196,8 @@ def _unit_quats(splats: Splats) -> Tensor:
 def _ply(splats: Splats, comments: Sequence[str]) -> bytes:
     """The ply of 3D Gaussian Splatting: float32, unit quaternions, harmonics by channel.
 
-    Its header is ASCII: viewers count letters of it, not bytes, to find the data.
+    Its header is ASCII, since viewers count letters of it, not bytes, to find the data; and its third line counts the
+    Gaussians, where the viewer of 3D Gaussian Splatting expects their number.
     """
     rest = splats.harmonics[:, 1:].transpose(1, 2).flatten(1)
     columns = {
@@ -209,9 +210,8 @@ def _ply(splats: Splats, comments: Sequence[str]) -> bytes:
         tuple(f"rot_{k}" for k in range(4)): _unit_quats(splats),
     }
     table = torch.cat([part.double() for part in columns.values()], dim=1).numpy().astype("<f4")
-    header = ["ply", "format binary_little_endian 1.0"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"comment {' '.join(each.split())}" for each in ((DISCS,) if splats.discs else ()) + tuple(comments)]
-    header += [f"element vertex {len(table)}"]
     header += [f"property float {name}" for names in columns for name in names]
     return "\n".join([*header, "end_header", ""]).encode("ascii", "backslashreplace") + table.tobytes()
 

@@ -93,9 +93,9 @@ def test_a_ply_of_discs_says_so_and_what_its_coordinates_are(tmp_path):
     assert header[:5] == [
         "ply",
         "format binary_little_endian 1.0",
+        "element vertex 400",  # in the third line, where the viewer of 3D Gaussian Splatting looks for it
         f"comment {DISCS}",
         "comment unit: metre",
-        "element vertex 400",
     ]
 
 
