@@ -175,7 +175,7 @@ def files_named(path: Path) -> set[Path]:
 
 def test_all_formats_refer_to_the_same_files_which_exist(world):
     named = {name: files_named(world / "facade" / name) for name in ("facade.xml", "facade.urdf", "model.sdf")}
-    texture = world.resolve() / "facade" / "visual.png"
+    texture = world.resolve() / "facade" / "facade.png"
     plugins = {each for each in named["model.sdf"] if "gz-sim" in each.name}
     assert named["facade.urdf"] == named["model.sdf"] - plugins == named["facade.xml"] - {texture}
     assert all(file.is_file() for file in named["facade.xml"])
@@ -391,7 +391,7 @@ def test_the_glb_is_upright_textured_and_small_enough(noisy, tmp_path, caplog):
 def test_simulators_have_the_whole_texture_however_small_the_glb_is(noisy, tmp_path, megabytes):
     facts = write_visual(tmp_path, noisy, np.zeros(len(noisy.faces), np.uint8), megabytes)
     assert facts["texture"] == [512, 512]
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "visual.png")), np.asarray(noisy.image))
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / f"{tmp_path.name}.png")), np.asarray(noisy.image))
 
 
 def test_a_glb_whose_triangles_alone_are_too_large_is_told(noisy, tmp_path, caplog):
@@ -420,3 +420,4 @@ def test_two_buildings_are_one_world(collider, tmp_path):
     assert compliance_errors(tmp_path / "world.usda") == []
     if SDFORMAT:
         assert "Valid" in sdformat("cmdCheck", tmp_path / "world.sdf")
+    assert {path.name for path in tmp_path.rglob("*.png")} == {"left.png", "right.png"}  # Gazebo compares no folders

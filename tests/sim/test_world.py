@@ -187,7 +187,7 @@ def test_the_command_writes_the_whole_folder(made):
         "report.html",
     ]:
         assert (out / name).stat().st_size > 0, name
-    names = "facade.xml facade.urdf facade.usda model.config model.sdf package.xml visual.glb visual.mtl visual.png"
+    names = "facade.xml facade.urdf facade.usda model.config model.sdf package.xml visual.glb visual.mtl facade.png"
     for name in f"{names} splats.ply deviations.ply deviations.json".split():
         assert (asset / name).stat().st_size > 0, name
     assert load(out / "world.xml").ngeom > 20

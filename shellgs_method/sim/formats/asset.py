@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 from shellgs_method.files.atomic import write_whole
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.look.visual import visual_file
+from shellgs_method.sim.look.visual import texture_file, visual_file
 
 FRICTION = 0.7
 """Coefficient of friction of walls and ground: that of rubber on concrete or stone is 0.6 to 0.85."""
@@ -38,6 +38,11 @@ class Asset:
     def colliders(self) -> list[tuple[str, str]]:
         """Name and file of each convex part; files are relative to the asset's folder."""
         return [(f"{self.name}_{number:03d}", part_file(number)) for number in range(self.parts)]
+
+    @property
+    def texture(self) -> str:
+        """File of the texture, relative to the asset's folder."""
+        return texture_file(self.name)
 
     @property
     def looks(self) -> list[tuple[str, str, SurfaceClass]]:

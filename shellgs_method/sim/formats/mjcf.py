@@ -10,7 +10,6 @@ import numpy as np
 from shellgs_method.sim.formats.asset import FRICTION, Asset, add
 from shellgs_method.sim.formats.ground import FIELD
 from shellgs_method.sim.ground import Ground
-from shellgs_method.sim.look.visual import TEXTURE
 
 TIMESTEP = 0.002
 """Time step in seconds: MuJoCo's default."""
@@ -40,7 +39,7 @@ def asset_mjcf(asset: Asset) -> ET.Element:
         friction=f"{FRICTION} 0.005 0.0001", rgba="0.6 0.7 0.8 1",
     )  # fmt: skip
     files, body = add(root, "asset"), add(add(root, "worldbody"), "body", name=name)
-    add(files, "texture", name=name, type="2d", file=TEXTURE)
+    add(files, "texture", name=name, type="2d", file=asset.texture)
     add(files, "material", name=name, texture=name, emission=1, specular=0, shininess=0)
     for mesh, file, _ in asset.looks:
         add(files, "mesh", name=mesh, file=file, inertia="shell")

@@ -34,7 +34,7 @@ A building's folder can be copied anywhere, and has no ground, light or physics 
 | `model.config`, `model.sdf` | for Gazebo |
 | `NAME.urdf`, `package.xml`, `CMakeLists.txt` | for URDF readers, and a ROS package of the building's name |
 | `collision/part_*.obj` | the convex parts, which are their own convex hulls |
-| `visual.obj`, `.mtl`, `.png` | the visual mesh, with a texture from the photographs |
+| `visual.obj`, `.mtl`, `NAME.png` | the visual mesh, with a texture from the photographs |
 | `visual_wall.obj`, … | its walls, windows, …, if the shell has classes: segmentation cameras distinguish them |
 | `visual.glb` | the same for browsers; y-up, as glTF requires |
 | `splats.ply` | the Gaussians |

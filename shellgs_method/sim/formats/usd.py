@@ -18,7 +18,7 @@ from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.asset import FRICTION, Asset
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.texture import TexturedMesh
-from shellgs_method.sim.look.visual import TEXTURE
+from shellgs_method.sim.look.visual import texture_file
 
 LAYERS = "usd"
 """Folder of the binary layers that an asset refers to, in the asset's."""
@@ -52,7 +52,7 @@ def write_usd_asset(
     pxr = import_pxr("sim")
     (folder / LAYERS).mkdir(exist_ok=True)
     with new_stage(pxr, folder / LAYERS / "visual.usdc", "z", metric) as stage:
-        _visual(pxr, stage, mesh, classes)
+        _visual(pxr, stage, name, mesh, classes)
     with new_stage(pxr, folder / LAYERS / "collision.usdc", "z", metric) as stage:
         _colliders(pxr, stage, parts)
     with new_stage(pxr, folder / LAYERS / "splats.usdc", "z", metric) as stage:
@@ -132,7 +132,7 @@ def _rub(pxr: SimpleNamespace, collider, material) -> None:
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
-def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"]) -> None:
+def _visual(pxr: SimpleNamespace, stage, name: str, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"]) -> None:
     pxr.UsdGeom.Xform.Define(stage, "/visual")
     prim = add_mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
     prim.CreateDoubleSidedAttr(True)
@@ -144,7 +144,7 @@ def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh, classes: UInt8[np.n
     reader = _shader(pxr, stage, "/visual/material/st", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set("st")
     texture = _shader(pxr, stage, "/visual/material/texture", "UsdUVTexture")
-    texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset).Set(f"../{TEXTURE}")
+    texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset).Set(f"../{texture_file(name)}")
     texture.CreateInput("sourceColorSpace", pxr.Sdf.ValueTypeNames.Token).Set("sRGB")
     where = reader.CreateOutput("result", pxr.Sdf.ValueTypeNames.Float2)
     texture.CreateInput("st", pxr.Sdf.ValueTypeNames.Float2).ConnectToSource(where)

@@ -17,7 +17,6 @@ from shellgs_method.files.atomic import atomic_write, write_whole
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.look.texture import TexturedMesh
 
-TEXTURE = "visual.png"
 LEAST_TEXTURE = 64
 """Shorter side in pixels below which a texture is scaled down no further: it shows nothing, and has hardly a size."""
 
@@ -30,14 +29,19 @@ def visual_file(each: SurfaceClass) -> str:
     return f"visual_{each.word}.obj" if each else "visual.obj"
 
 
-def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"], megabytes: float) -> dict:
-    """Write ``visual.glb`` (y-up, as glTF requires), and objs with ``visual.mtl`` and ``visual.png``.
+def texture_file(name: str) -> str:
+    """The texture of a building, by whose name Gazebo tells textures apart, whatever their folders are."""
+    return f"{name}.png"
 
-    The texture of the glb alone is scaled down: simulators show ``visual.png``. There is an obj for each class of
+
+def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"], megabytes: float) -> dict:
+    """Write ``visual.glb`` (y-up, as glTF requires), and objs with ``visual.mtl`` and the texture.
+
+    The texture of the glb alone is scaled down: simulators show the png. There is an obj for each class of
     surface: simulators segment images by object.
 
     Args:
-        folder: output folder.
+        folder: output folder, with the name of the building.
         mesh: textured mesh, z up.
         classes: class of each triangle.
         megabytes: maximum size of the glb; its texture is scaled down to fit.
@@ -52,9 +56,10 @@ def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " 
             "texture: give fewer --faces or more --megabytes."
         )
     write_whole(folder / "visual.glb", content)
-    with atomic_write(folder / TEXTURE) as file:
+    texture = texture_file(folder.name)
+    with atomic_write(folder / texture) as file:
         mesh.image.save(file, "PNG")
-    write_whole(folder / "visual.mtl", f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n")
+    write_whole(folder / "visual.mtl", f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture}\n")
     for each in map(SurfaceClass, np.unique(classes)):
         write_whole(folder / visual_file(each), _obj(mesh, mesh.faces[classes == each]))
     sizes = {"texture": list(mesh.image.size), "glb_texture": list(small)}
