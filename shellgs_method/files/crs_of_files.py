@@ -35,6 +35,8 @@ _CORNER = re.compile(rb"lowerCorner[^>]*>\s*(-?\d+(?:\.\d+)?\s+-?\d+(?:\.\d+)?)[
 """Of the first envelope of a CityGML: longitude and latitude, in either order, and a height."""
 _VERTICAL, _VERTICAL_UNIT, _EPSG = 4096, 4099, range(1024, 32767)
 """GeoTIFF keys of the system of heights and of their unit, and what may be a code of EPSG there."""
+_WKT = "LASF_Projection", (2112,)
+"""User and number of the record of a LAS that holds a WKT."""
 _UNIT, _FEET = 3076, {9002: "0.3048", 9003: "0.30480061"}
 """GeoTIFF key of the unit of eastings, and metres of feet and of US survey feet."""
 _HEIGHTS = {9001: 5703, 9002: 8228, 9003: 6360}
@@ -155,11 +157,16 @@ def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:
 def _of_las(header: LasHeader, path: Path) -> str:
     """A scan's system, which laspy reads without heights; with them where they are in another unit.
 
-    If it has none but is in feet, this is reported.
+    If it has none but is in feet, this is reported. A WKT that laspy does not read is returned as it is.
     """
     from pyproj.crs import CRS, CompoundCRS
+    from pyproj.exceptions import CRSError
 
-    crs = header.parse_crs()
+    crs = None
+    with suppress(CRSError):
+        crs = header.parse_crs()
+    if crs is None and (text := _wkt_of(header)):
+        return text
     directories: Any = header.vlrs.get("GeoKeyDirectoryVlr")
     keys: dict[int, int] = {key.id: key.value_offset for each in directories for key in each.geo_keys}
     if crs is None:
@@ -175,6 +182,16 @@ def _of_las(header: LasHeader, path: Path) -> str:
         if _differ({axis.unit_conversion_factor for axis in (*crs.axis_info, *heights.axis_info)}):
             crs = CompoundCRS(crs.name, [crs, heights])
     return crs.to_wkt()
+
+
+def _wkt_of(header: LasHeader) -> str:
+    """The WKT in the records of a LAS, which programs on Windows write in a code page, too; empty if there is none."""
+    records = [each for some in (header.vlrs, header.evlrs) if some for each in some.get_by_id(*_WKT)]
+    data = records[0].record_data_bytes().strip(b"\0") if records else b""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def metres_of(system: str, given: float | None, shell: Sequence[Path]) -> float:

@@ -190,6 +190,18 @@ def test_heights_of_a_scan_in_another_unit_are_refused(tmp_path, system, keys, d
         assert found == f"EPSG:{system}"
 
 
+GAUSS = pyproj.CRS.from_epsg(5678).to_wkt("WKT1_GDAL").replace("Gauss-Kruger", "Gauss-Krüger")
+
+
+@pytest.mark.parametrize("wkt", [GAUSS.encode("cp1252"), GAUSS.encode(), b'PROJCS["NAD83 (ftUS)",GEOGCS["NAD83"'])
+def test_a_wkt_of_a_scan_that_laspy_does_not_read_is_read_or_told(tmp_path, caplog, wkt):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.vlrs.append(laspy.VLR("LASF_Projection", 2112, record_data=wkt + b"\0"))
+    laspy.LasData(header).write(str(tmp_path / "a.las"))
+    if crs_of(tmp_path / "a.las") != "EPSG:5678":
+        assert 'a.las names no coordinate reference system that PROJ knows (PROJCS["NAD83 (ftUS)' in caplog.text
+
+
 def test_a_scan_in_feet_of_an_unknown_system_is_told(tmp_path, caplog):
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.add_crs(pyproj.CRS.from_epsg(2263), keep_compatibility=True)
