@@ -42,8 +42,8 @@ from shellgs_method.sim.workspace import Workspace
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
-RESERVED = ("world", "site", "ground", "physics", "light", "sun", "friction")
-"""Names of parts of a world, in one format or another."""
+RESERVED = ("world", "site", "ground", "physics", "light", "sun", "friction", "package")
+"""Names of parts of a world, in one format or another, and of an asset's file that is another's, ``package.xml``."""
 OUTDATED = "facade.xml"
 """A file that version 0.2.0 wrote, which knew no folder for each building."""
 MAX_GAP = 2.0

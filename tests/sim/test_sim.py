@@ -341,9 +341,10 @@ def test_a_cellar_is_no_ground():
 
 
 def test_a_building_is_never_named_as_a_part_of_the_world_or_another():
-    assert [_name(scene, ["Town_hall"]) for scene in ("ground", "World", "town hall", "7 b")] == [
+    assert [_name(scene, ["Town_hall"]) for scene in ("ground", "World", "package", "town hall", "7 b")] == [
         "building_ground",
         "building_World",
+        "building_package",  # whose MJCF would be replaced by ROS' package.xml
         "town_hall_2",
         "building_7_b",
     ]
