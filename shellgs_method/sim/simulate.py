@@ -34,7 +34,7 @@ from shellgs_method.sim.frame import FRAME
 from shellgs_method.sim.free_space import FreeSpace
 from shellgs_method.sim.ground import STEP, Ground
 from shellgs_method.sim.look.texture import bake
-from shellgs_method.sim.look.visual import write_visual
+from shellgs_method.sim.look.visual import without_specks, write_visual
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.trials.engine import import_mujoco
@@ -190,7 +190,7 @@ def _building(
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
     tell("Baking the texture")
     textured = bake(fused, colours, made.photos, settings.texel)
-    classes = made.classes_at(textured.vertices[textured.faces].mean(axis=1))
+    classes = without_specks(textured, made.classes_at(textured.vertices[textured.faces].mean(axis=1)))
     facts = write_visual(folder, textured, classes, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
     asset = Asset(folder.name, len(collider.parts), [SurfaceClass(each) for each in np.unique(classes)])

@@ -20,6 +20,7 @@ from worlds import check_rays, compliance_errors, frame_at, painted, some_splats
 from benchmarks.engines import newton_lidar, newton_model
 from shellgs_method.errors import SceneError
 from shellgs_method.files.usd import import_pxr
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.collision.collider import Collider
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.asset import FRICTION
@@ -27,7 +28,7 @@ from shellgs_method.sim.formats.mjcf import STIFF
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.look.texture import TexturedMesh
-from shellgs_method.sim.look.visual import write_visual
+from shellgs_method.sim.look.visual import visual_file, without_specks, write_visual
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, lidar, load, read_spec
 
 ROBOT = """
@@ -406,6 +407,27 @@ def test_there_is_an_obj_for_each_class_of_surface(world, collider):
     assert {*meshes} == {"visual_wall", "visual_door"}
     assert sum(len(mesh.faces) for mesh in meshes.values()) == len(collider.surface.faces)
     assert meshes["visual_wall"].triangles_center[:, 2].min() > 3 >= meshes["visual_door"].triangles_center[:, 2].max()
+
+
+@pytest.mark.parametrize("count", [1, 10])
+def test_a_class_of_surface_that_mujoco_refuses_is_none(collider, tmp_path, count):
+    """One triangle, and several without area."""
+    mujoco, look = import_mujoco(), painted(collider.surface)
+    look.vertices[look.faces[1:count]] = look.vertices[0]
+    classes = np.full(len(look.faces), SurfaceClass.WALL, np.uint8)
+    classes[slice(1) if count == 1 else slice(1, count)] = SurfaceClass.DOOR
+
+    def model(used: np.ndarray):
+        write_visual(tmp_path, look, used, 30)
+        spec = mujoco.MjSpec()
+        for each in map(SurfaceClass, np.unique(used)):
+            kind = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            spec.add_mesh(name=each.word, file=str(tmp_path / visual_file(each)), inertia=kind)
+        return spec.compile()
+
+    with pytest.raises(ValueError, match=r"vertices required|too small"):
+        model(classes)
+    assert model(without_specks(look, classes)).nmesh == 1
 
 
 def test_two_buildings_are_one_world(collider, tmp_path):

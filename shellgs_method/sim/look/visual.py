@@ -15,10 +15,13 @@ from trimesh.visual.material import PBRMaterial
 from shellgs_method.errors import notice
 from shellgs_method.files.atomic import atomic_write, write_whole
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import area_vectors
 from shellgs_method.sim.look.texture import TexturedMesh
 
 LEAST_TEXTURE = 64
 """Shorter side in pixels below which a texture is scaled down no further: it shows nothing, and has hardly a size."""
+LEAST_AREA = 1e-4
+"""Square metres below which there is no class of surface in a building."""
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns z-up coordinates into y-up ones."""
@@ -27,6 +30,17 @@ Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 def visual_file(each: SurfaceClass) -> str:
     """The obj of the triangles of a class; all are OTHER where no classes are known."""
     return f"visual_{each.word}.obj" if each else "visual.obj"
+
+
+def without_specks(mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"]) -> UInt8[np.ndarray, " F"]:
+    """Classes of a mesh's triangles, with the largest in place of those that have next to no surface.
+
+    MuJoCo refuses a mesh of less than four vertices, or without area, and so the whole world.
+    """
+    areas = np.bincount(classes, np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1))
+    corners = {each: np.unique(mesh.faces[classes == each]) for each in np.unique(classes)}
+    specks = [each for each in corners if areas[each] < LEAST_AREA or len(corners[each]) < 4]
+    return np.where(np.isin(classes, specks), areas.argmax(), classes).astype(np.uint8)
 
 
 def texture_file(name: str) -> str:
