@@ -81,7 +81,9 @@ export GZ_SIM_RESOURCE_PATH=$PWD
 gz sim world.sdf
 ```
 
-Harmonic or later collides with the parts' convex hulls, earlier versions with their triangles.
+Garden or later is needed: Fortress, of ROS 2 Humble, has other names for its systems, and moves nothing (in all `.sdf`
+files, replace `gz-sim` by `ignition-gazebo` and `gz::sim` by `ignition::gazebo`). Harmonic or later collides with the
+parts' convex hulls, Garden with their triangles.
 
 ## PyBullet and other readers of URDF
 

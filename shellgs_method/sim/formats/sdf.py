@@ -26,7 +26,7 @@ SYSTEMS = {
     "contact": "Contact",
     "navsat": "NavSat",
 }
-"""File and class of the systems of a world: one that names any gets no others."""
+"""File and class of the systems of a world: one that names any gets no others. Fortress has other names for them."""
 
 
 def asset_sdf(asset: Asset) -> ET.Element:
