@@ -167,6 +167,19 @@ def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
     assert "not on the outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
 
 
+@pytest.mark.parametrize("solid", [False, True])
+def test_semantics_that_are_not_nested_as_their_surfaces_are_left_out_and_told(tmp_path: Path, caplog, solid):
+    document = made.cityjson(house())
+    (geometry,) = document["CityObjects"]["a"]["geometry"]
+    if solid:
+        geometry |= {"type": "Solid", "boundaries": [geometry["boundaries"]]}
+    else:
+        geometry["semantics"]["values"] = [geometry["semantics"]["values"]]
+    found = read_geometry(made.save_json(tmp_path / "a.json", document))
+    assert (found.classes == SurfaceClass.OTHER).all()
+    assert "1 semantics that are not nested as their surfaces" in caplog.text
+
+
 @pytest.mark.parametrize("value", [-1, 999])
 def test_polygons_whose_surface_is_none_of_the_list_are_read(tmp_path: Path, value: int):
     """Python takes -1 for the last of a list."""

@@ -142,6 +142,9 @@ class _Document:
             return
         semantics = geometry.get("semantics") or {}
         surfaces, values = semantics.get("surfaces", []), semantics.get("values")
+        if not _nested(values, _DEPTHS[kind]):
+            self.missing["semantics that are not nested as their surfaces"] += 1
+            values = None
         yield from self._flattened(geometry["boundaries"], values, _DEPTHS[kind], vertices, surfaces)
 
     def _flattened(
@@ -159,6 +162,13 @@ class _Document:
                 if isinstance(value, int) and 0 <= value < len(surfaces):
                     surface = str(surfaces[value]["type"]).lstrip("+")
                 yield Polygon([ring_of(_at(vertices, ring)) for ring in boundary], surface)
+
+
+def _nested(values: Any, depth: int) -> bool:
+    """Whether values are lists of lists, so deep, of which any may be null."""
+    if not isinstance(values, list):
+        return values is None
+    return all(_nested(each, depth - 1) if depth else not isinstance(each, list) for each in values)
 
 
 def _at(vertices: Float64[np.ndarray, "V 3"], indices: list[int]) -> Float64[np.ndarray, "N 3"]:
