@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from PIL import ExifTags, Image, ImageOps
+from scipy.stats import rankdata
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.exif import orientation_of, tags_of
@@ -173,17 +174,19 @@ def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, 
 
 
 def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
-    """Report photographs that show the same as others, such as those that a messenger encoded again."""
+    """Report photographs that show the same as others: encoded again by a messenger, or exposures of a bracket."""
     small = np.stack([_small(folder / name) for name in names])
+    ranked = np.stack([rankdata(each, axis=None).reshape(each.shape) for each in small])  # as in any exposure
     copies = [
         (name, names[int(alike.argmax())])
         for k, name in enumerate(names)
-        if (alike := show_the_same(small[:k], small[k])).any()
+        if (alike := show_the_same(small[:k], small[k]) | show_the_same(ranked[:k], ranked[k])).any()
     ]
     if copies:
         notice(
             f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, "
-            "for example): remove the copies, or metrics of held-out photographs will be too good."
+            "for example): remove the copies, and all but one exposure of each bracket, or metrics of held-out "
+            "photographs will be too good."
         )
 
 

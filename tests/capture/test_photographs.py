@@ -148,6 +148,15 @@ def test_photographs_that_were_encoded_again_are_told(tmp_path, caplog):
     assert "1 of 4 photographs show the same as others (sent.jpg as IMG_1.jpg, for example)" in caplog.text
 
 
+def test_exposures_of_a_bracket_are_told(tmp_path, caplog):
+    for k in range(3):
+        shown = photograph(64, 48, seed=k).resize((640, 480))
+        shown.save(tmp_path / f"IMG_{k}.jpg")
+        shown.point(lambda level: 0.3 * level).save(tmp_path / f"IMG_{k}_dark.jpg")
+    tell_of_near_copies(tmp_path, sorted(path.name for path in tmp_path.iterdir()))
+    assert "3 of 6 photographs show the same as others (IMG_0_dark.jpg as IMG_0.jpg, for example)" in caplog.text
+
+
 @pytest.mark.parametrize(("fraction", "told"), [("123", True), ("00", False), (None, False)])
 def test_photographs_of_one_moment_are_told(tmp_path, caplog, fraction, told):
     """An iPhone's IMG_E0001 is IMG_0001 as it was edited there; without fractions of seconds, they may be a burst."""
