@@ -244,7 +244,13 @@ def _drawn_to(
     surface: ShellSurface, seen: Observations, positions: Positions, bundle: Bundle, marks: _Marks
 ) -> tuple[Bundle, Objective]:
     """Rounds of leaving out wrong observations, looking for the closest planes and adjusting to them."""
-    seen = seen.of_points(np.bincount(seen.points, minlength=len(bundle.points)) >= _VIEWS)
+    tracks = np.bincount(seen.points, minlength=len(bundle.points)) >= _VIEWS
+    if tracks.sum() < FEW:
+        raise SceneError(
+            f"only {tracks.sum()} SfM points are seen in {_VIEWS} photographs or more, as in models that a network "
+            "wrote: too few to adjust the cameras by; triangulate the points with COLMAP"
+        )
+    seen = seen.of_points(tracks)
     objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions, planes=marks.planes)
     gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
     gates += [GATE] * (_ROUNDS - len(gates))

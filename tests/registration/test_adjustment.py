@@ -285,6 +285,14 @@ def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
         )
 
 
+def test_points_that_one_photograph_sees_each_are_refused(surface: ShellSurface, model: Model):
+    """Networks such as VGGT write each pixel's point with itself as its track."""
+    first = np.unique(model.points.tracks["point"], return_index=True)[1]
+    alone = replace(model, points=replace(model.points, tracks=model.points.tracks[first]))
+    with pytest.raises(SceneError, match="only 0 SfM points are seen in 3 photographs or more"):
+        adjusted(surface, alone, surface.survey_from_shell, NAMES)
+
+
 def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: ShellSurface, bent: Model):
     matrix = write(tmp_path, bent, building(Layout(5, 3)))
     files = {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()}
