@@ -70,6 +70,12 @@ def check_points(points: SparsePoints, views: Sequence[View], photographs: Seque
                 "photographs of the model: if they are in another order, rotated, cropped, or others with these "
                 "names, put back those that the cameras were found with."
             )
+        if astray := _contradicted(points, views):
+            notice(
+                f"{len(astray)} of {len(views)} cameras, that of {astray[0]} for example, do not see {points.called} "
+                "where the photograph's own keypoints show them: they were changed separately, or are from another "
+                "model; give the files of one, or leave these photographs out."
+            )
         if (share := _ignored(points, photographs)) > _MOSTLY:
             notice(
                 f"masks, or transparent pixels, ignore {share:.0%} of {points.called}, as if they were inverted: white "
@@ -244,6 +250,25 @@ def _are_others(points: SparsePoints, photographs: Sequence[Shown]) -> bool:
             others += [(colours, _at(pixels, other)) for other in alike]
     theirs = _correlation(own)
     return theirs < _OWN and theirs < _correlation(others) + _MORE
+
+
+def _contradicted(points: SparsePoints, views: Sequence[View]) -> list[str]:
+    """Photographs whose cameras see points elsewhere than where their own keypoints show them, in the median."""
+    observed = points.observed or {}
+    sights = {
+        view.name: _Sight(
+            points.positions,
+            np.empty((0, 3)),
+            [view.camera],
+            (),
+            [observed[view.name]],
+            [points.features[view.name]],
+            [view.lens],
+        )
+        for view in views
+        if view.name in points.features
+    }
+    return [name for name, sight in sights.items() if sight._scaled().drift(points.positions) > _DRIFTED]
 
 
 def _kept(

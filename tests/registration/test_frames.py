@@ -207,6 +207,15 @@ def test_a_model_whose_tracks_contradict_its_cameras_is_told(scene, points, view
     assert told == (shown not in ("keypoints of a script", "numbers of other keypoints"))
 
 
+def test_single_cameras_that_contradict_their_keypoints_are_named(points, views, caplog):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix()
+    camera = views[2].camera
+    turned = replace(views[2], camera=replace(camera, viewmat=torch.from_numpy(turn) @ camera.viewmat))
+    check_points(tracked(points, views), [*views[:2], turned, *views[3:]])
+    assert f"1 of {len(views)} cameras, that of {turned.name} for example, do not see" in caplog.text
+
+
 @pytest.mark.parametrize("inverted", [False, True])
 def test_masks_that_ignore_nearly_all_points_are_told(points, views, tmp_path, inverted, caplog):
     passer_by = np.full((views[0].camera.height, views[0].camera.width), 0 if inverted else 255, np.uint8)
