@@ -37,6 +37,8 @@ ROUNDING = 1e-6
 """Harmless rounding of positions to float32, as a share of the cameras' spread."""
 TAKEN_OUT = 0.25
 """Share of the photographs that a user may have taken out of their folder: it is another one if more are missing."""
+_ROUNDS = 4  # of a rig, that show more than chance
+_ALIKE, _OTHER = 0.87, 0.5  # cosines between the directions of one camera from round to round, and of others
 
 
 @dataclass
@@ -112,6 +114,7 @@ class FacadeDataParser(DataParser):
             tell_of_borders(shown, config.data)
         else:
             _tell_of_copies(recording, whole, config)
+            _tell_of_one_side(recording, config)
         placed = scale * transformed(points.positions, transform)
         metres_per_unit = shell.metres_per_unit if shell else None
         to_world = np.eye(4)
@@ -243,6 +246,25 @@ def _tell_of_copies(recording: Recording, held_out: Sequence[int], config: Facad
         notice(
             f"{len(both)} of {len(held)} held-out photographs of {config.data} are copies of others that are trained "
             f"on ({one} of {other}, for example): their metrics are too good; remove one of the two from the scene."
+        )
+
+
+def _tell_of_one_side(recording: Recording, config: FacadeDataParserConfig) -> None:
+    """Tell the user if all held-out photographs are of one camera of a rig, or of one face of panoramas.
+
+    So they are if names go round the cameras, and the interval is a multiple of their number.
+    """
+    interval, directions = config.eval_interval, np.stack([f.camera.viewmat[2, :3].numpy() for f in recording.frames])
+    rounds = directions[: len(directions) // interval * interval].reshape(-1, interval, 3)
+    if recording.listed or len(rounds) < _ROUNDS:
+        return
+    onward = (rounds[1:] * rounds[:-1]).sum(axis=2)
+    between = (rounds[:, 1:] @ rounds[:, 0, :, None]).min(axis=(1, 2))
+    if np.quantile(onward, 0.25) > _ALIKE and np.median(between) < _OTHER:
+        notice(
+            f"the held-out photographs of {config.data}, one in {interval} by name, all look to one side, unlike "
+            "those between them, as of one camera of a rig or one face of panoramas: metrics are of that side alone. "
+            f"Hold out others with facade-data --eval-interval {interval + 1}."
         )
 
 

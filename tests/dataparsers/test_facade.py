@@ -41,6 +41,24 @@ def test_every_eighth_image_by_sorted_name_is_held_out_starting_with_the_first(p
     assert len(names(parse(pristine_scene, "train"))) == 8
 
 
+def test_held_out_photographs_that_are_all_of_one_camera_of_a_rig_are_told(scene, caplog):
+    meta = json.loads((scene / "transforms.json").read_text())
+    frames = []
+    for k, frame in enumerate(meta["frames"][:5]):
+        for yaw in range(4):
+            turn = np.eye(4)
+            turn[:3, :3] = cv2.Rodrigues(np.array([0, yaw * np.pi / 2, 0]))[0]
+            name = f"images/{k}_camera{yaw}.png"
+            shutil.copy(scene / frame["file_path"], scene / name)
+            frames.append({"file_path": name, "transform_matrix": (frame["transform_matrix"] @ turn).tolist()})
+    (scene / "transforms.json").write_text(json.dumps(meta | {"frames": frames}))
+    parse(scene, "test", eval_interval=5)
+    assert "look to one side" not in caplog.text
+    parse(scene, "test", eval_interval=4)
+    assert "one in 4 by name, all look to one side" in caplog.text
+    assert "--eval-interval 5" in caplog.text
+
+
 @pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
 def test_photographs_that_a_user_took_out_of_their_folder_are_left_out(shellgs, scene, kind, caplog):
     if kind == "COLMAP":
