@@ -151,6 +151,7 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
         )
     frames = sorted(frames, key=lambda frame: frame.name)
     _tell_of_far(frames, where)
+    _tell_of_repeated(frames, where)
     for one, other in pairwise(frames):
         if one.name == other.name:
             raise SceneError(f"{where} has two cameras for the photograph {one.name}: leave one of them out")
@@ -172,6 +173,20 @@ def _tell_of_far(frames: Sequence[Frame], where: str) -> None:
             f"{where} has {len(names)} of {len(frames)} cameras far from all others, that of {names[0]} for example, "
             "probably placed wrongly by structure from motion: move these photographs away, unless they were taken "
             "from there."
+        )
+
+
+def _tell_of_repeated(frames: Sequence[Frame], where: str) -> None:
+    """Report photographs of one pose, which phones and SLAM write where they lost track; no two estimates are equal."""
+    posed: dict[bytes, list[str]] = {}
+    for frame in frames:
+        posed.setdefault(frame.camera.viewmat.numpy().tobytes(), []).append(frame.name)
+    if repeated := [names for names in posed.values() if len(names) > 1]:
+        first, second = repeated[0][:2]
+        notice(
+            f"{where} has {sum(map(len, repeated))} photographs with exactly the pose of another, {first} and {second} "
+            "for example, as programs write where they lost track: move these photographs away, unless the camera "
+            "stood still."
         )
 
 

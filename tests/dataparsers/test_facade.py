@@ -173,6 +173,18 @@ def test_a_camera_far_from_all_others_does_not_shrink_the_scene(scene, away, cap
     assert "far from all others" not in caplog.text
 
 
+def test_photographs_of_one_pose_are_told(scene, caplog):
+    meta = json.loads((scene / "transforms.json").read_text())
+    for frame in meta["frames"][4:6]:
+        frame["transform_matrix"] = meta["frames"][3]["transform_matrix"]
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    views_of(scene)
+    told = (
+        "3 photographs with exactly the pose of another, images/frame_00004.png and images/frame_00005.png for example"
+    )
+    assert told in caplog.text
+
+
 @pytest.mark.parametrize(("apart", "elsewhere"), [(1e-16, 6), (1e-16, 1), (0.02, 6)])
 def test_no_cameras_are_far_where_most_are_of_one_panorama_or_tripod(apart, elsewhere):
     """The scene was scaled by what the cameras of a panorama are apart, which is rounding."""
