@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from PIL import ExifTags, Image, ImageOps
-from scipy.stats import rankdata
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.exif import orientation_of, tags_of
@@ -173,10 +172,16 @@ def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, 
     return np.abs(after - before).mean((-2, -1)) < _SAME * moved
 
 
+def _ranks(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Rank of each pixel's brightness, the mean one of equals, which is the same in any exposure but where it clips."""
+    ordered = np.sort(picture, axis=None)
+    return (np.searchsorted(ordered, picture) + np.searchsorted(ordered, picture, "right")) / 2
+
+
 def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
     """Report photographs that show the same as others: encoded again by a messenger, or exposures of a bracket."""
     small = np.stack([_small(folder / name) for name in names])
-    ranked = np.stack([rankdata(each, axis=None).reshape(each.shape) for each in small])  # as in any exposure
+    ranked = np.stack([_ranks(each) for each in small])
     copies = [
         (name, names[int(alike.argmax())])
         for k, name in enumerate(names)
