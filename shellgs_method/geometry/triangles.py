@@ -78,6 +78,12 @@ class Triangles:
         """Centre of each triangle."""
         return self.vertices[self.faces].mean(axis=1)
 
+    def within(self, low: Float64[np.ndarray, " K"], high: Float64[np.ndarray, " K"]) -> Triangles:
+        """The whole triangles whose bounding boxes reach into a box along the first K axes."""
+        corners = self.vertices[self.faces, : len(low)]
+        inside = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) <= high).all(axis=1)
+        return Triangles(*referenced(self.vertices, self.faces[inside]))
+
     def cast(self, origins: Float[np.ndarray, "*#N 3"], directions: Float[np.ndarray, "*#N 3"]) -> Hits:
         """First hits of rays; origins and directions, of any length, are broadcast."""
         return self.cast_rays(rays_from(origins, directions))

@@ -26,7 +26,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
-from shellgs_method.registration.geotags import REACH, GeoTags
+from shellgs_method.registration.geotags import REACH, GeoTags, has_geo_tags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
@@ -45,6 +45,7 @@ REPORT = Path("shell/report")
 
 _RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
 _ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
+_LOCAL = 10_000  # units from the origin, within which a shell is not in a coordinate reference system
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
 
@@ -281,12 +282,10 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     if tags is not None:
         off = tags.apart(best.survey_from_scene)
-        elsewhere = (
-            ": it agrees with none, so check that the building and --crs are the right ones, and crop a shell of a "
-            "whole district to what photographs show"
-        )
-        said = elsewhere if off >= REACH else ""
+        said = ": it agrees with none, so check that the building and --crs are the right ones" if off >= REACH else ""
         history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
+    elif not unplaced.crs and has_geo_tags(views) and np.abs(mesh.centre).max() > _LOCAL:
+        history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals

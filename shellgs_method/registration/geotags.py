@@ -61,10 +61,33 @@ class GeoTags:
         shell = np.pad(ground[known], ((0, 0), (0, 1)))
         return GeoTags(cameras, transformed(shell, survey_from_shell)[:, :2])
 
+    def scales(self, up: Float64[np.ndarray, " 3"]) -> tuple[float, float]:
+        """Least and greatest scale, in metres per unit of the scene, by how far apart the photographs were taken.
+
+        Args:
+            up: up direction of the scene.
+        """
+        level = self.cameras - np.outer(self.cameras @ up, up) / (up @ up)
+        there, here = (np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)) for p in (self.places, level))
+        return max(there - REACH, 0.0) / max(here, 1e-12), (there + REACH) / max(here, 1e-12)
+
+    def shift(self, similarity: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 2"]:
+        """The shift, in metres to the east and north, that takes cameras to their geo-tags in the median.
+
+        Args:
+            similarity: rotation from the scene to the shell's frame, times the scale.
+        """
+        return np.median(self.places - (self.cameras @ similarity.T)[:, :2], axis=0)
+
     def apart(self, survey_from_scene: Float64[np.ndarray, "4 4"]) -> float:
         """Median distance, on the ground, of cameras from their geo-tags under an alignment, in metres."""
         placed = transformed(self.cameras, survey_from_scene)[:, :2]
         return float(np.median(np.linalg.norm(placed - self.places, axis=1)))
+
+
+def has_geo_tags(views: Sequence[View]) -> bool:
+    """Whether enough photographs for :class:`GeoTags` have one."""
+    return sum(_geo_tag(view.image) is not None for view in views) >= _LEAST
 
 
 def _geo_tag(path: Path) -> tuple[float, float] | None:

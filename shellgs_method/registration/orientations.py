@@ -50,16 +50,19 @@ def scene_axes(
     raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
 
 
-def shell_axes(normals: Float64[np.ndarray, "N 3"]) -> list[Float64[np.ndarray, "3 3"]]:
+def shell_axes(
+    normals: Float64[np.ndarray, "N 3"], up: Float64[np.ndarray, " 3"] | None = None
+) -> list[Float64[np.ndarray, "3 3"]]:
     """Right, up and out of the shell's walls, as rows: in each orientation that it may have in its file, all quarters.
 
     Args:
         normals: of the surface, evenly by area, of any sign.
+        up: up direction of the shell, if it is known: all headings are tried, as walls may be those of many buildings.
     """
     found = []
-    for up in _upwards(normals):
-        for out in _headings(normals, up):
-            axes = wall_axes(out, up)
+    for upright in _upwards(normals) if up is None else [up]:
+        for out in _headings(normals, upright, of_one_building=up is None):
+            axes = wall_axes(out, upright)
             quarter = np.stack([axes[2], axes[1], -axes[0]])
             found += [np.diag([sign, 1, sign]) @ turned for turned in (axes, quarter) for sign in (1, -1)]
     return found
@@ -92,8 +95,8 @@ def _aligned(normals: np.ndarray, axes: np.ndarray) -> float:
     return float((np.abs(normals @ axes.T) > _ALIKE).any(axis=1).mean())
 
 
-def _headings(normals: np.ndarray, up: np.ndarray) -> Sequence[np.ndarray]:
-    """Directions of the walls, one of each right angle, those of the largest area first."""
+def _headings(normals: np.ndarray, up: np.ndarray, *, of_one_building: bool) -> Sequence[np.ndarray]:
+    """Directions of the walls, one of each right angle, those of the largest area first; of many buildings, all."""
     east = across(up)
     north = np.cross(up, east)
     upright = normals[np.abs(normals @ up) < _UPRIGHT]
@@ -104,7 +107,7 @@ def _headings(normals: np.ndarray, up: np.ndarray) -> Sequence[np.ndarray]:
     best = []
     for angle in np.argsort(-counts):
         apart = [abs((angle - other + 45) % 90 - 45) for other in best]
-        if counts[angle] < 0.35 * counts.max() or len(best) == _HEADINGS:
+        if of_one_building and (counts[angle] < 0.35 * counts.max() or len(best) == _HEADINGS):
             break
         if all(each > 8 for each in apart):
             best.append(angle)

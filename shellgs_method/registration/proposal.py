@@ -22,11 +22,13 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.progress import track
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.refinement import FINAL_GATE, refine
 from shellgs_method.registration.sightlines import Sightlines
+from shellgs_method.registration.validation import LIMITS
 from shellgs_method.shell.surface import ShellSurface
 
 AMBIGUOUS = 0.90
@@ -47,6 +49,7 @@ _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
 _DIFFERENT_FROM_AFAR = 0.01
+_NEAR = 3 * REACH  # metres from geo-tags
 
 
 @dataclass(frozen=True)
@@ -78,50 +81,79 @@ def propose(
         points: SfM points in the scene's frame.
         views: photographs, all taken from outside the building.
         scene_up: approximate up direction of the cameras.
-        tags: geo-tags of the photographs: only alignments near them are looked at, if there are any; of those that
-            fit well, only ones about as near as the nearest, since all tags may have a common bias.
+        tags: geo-tags of the photographs, for a shell whose z axis is up. The search is near them, in a shell that may
+            be of a whole district, and elsewhere only if the shell does not fit there.
 
     Raises:
         SceneError: the SfM points have no main wall, or it fits nowhere.
     """
-    samples, triangle = surface.samples(_SAMPLES)
-    cameras = positions(view.camera for view in views)
-    near = _most(points.positions)
-    axes = scene_axes(near, cameras, scene_up)
-    sight = Sightlines.of(views, points)
-    fit = _Fit(surface, np.random.default_rng(0).permutation(near), sight, samples[:200])
-    search = _Search.of(samples, near, sight)
-    turns = [to.T @ axes for to in shell_axes(surface.normals[triangle])]
-    starts = [start for turn in track(turns, "Trying orientations", len(turns)) for start in search.placed(turn)]
-    if tags is not None:
-        agreeing = [start for start in starts if tags.apart(start.survey_from_scene) < 3 * REACH]
-        starts, tags = (agreeing, tags) if agreeing else (starts, None)
-    starts = fit.distinct(starts, _MEASURED, search.cell)
-    starts = [fit.measured(s.survey_from_scene, _ROUGH) for s in track(starts, "Measuring candidates", len(starts))]
-    for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
-        starts = fit.distinct(starts, count, apart * search.cell)
-        starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
-        hopeful = track(starts, f"Refining candidates, round {number}", len(starts))
-        starts = [found for s in hopeful for found in fit.refined(s, few, reach * search.cell, _COARSE, steps)]
-    different = max([_DIFFERENT, *(_DIFFERENT_FROM_AFAR * sight.distance(s.survey_from_scene) for s in starts[:1])])
-    starts = fit.distinct(starts, _POLISHED, different)
-    polished = []
-    for start in track(starts, "Refining the best", len(starts)):
-        polished += fit.refined(start, _MANY, 2 * _COARSE * sight.distance(start.survey_from_scene), _FIT, 30)
-    polished = [candidate for candidate in polished if candidate.score > 0]
-    if not polished:
+    seen = _Seen.of(views, points, scene_up)
+    near = _near(tags, surface, seen) if tags is not None else []
+    if near and near[0].score > LIMITS["agreement"].refused:
+        return near
+    anywhere = _anywhere(surface, seen)
+    if near and (not anywhere or near[0].score > AMBIGUOUS * anywhere[0].score):
+        return near
+    if not anywhere:
         size = float(np.ptp(surface.vertices, axis=0).max())
         raise SceneError(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
         )
-    if tags is not None:
-        apart = [tags.apart(candidate.survey_from_scene) for candidate in polished]
-        least = AMBIGUOUS * max(candidate.score for candidate in polished)
-        nearest = min(off for off, candidate in zip(apart, polished, strict=True) if candidate.score >= least)
-        polished = [candidate for off, candidate in zip(apart, polished, strict=True) if off <= nearest + REACH]
-    best, *others = fit.distinct(polished, _POLISHED, different)
-    return [best, *(replace(other, displacement=fit.displacement(best, other)) for other in others)]
+    return anywhere
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the photographs show, in the scene's frame.
+
+    Attributes:
+        points: SfM points, without those far out.
+        sight: sightlines to some.
+        axes: right, up and out of the main wall, as rows.
+    """
+
+    points: np.ndarray
+    sight: Sightlines
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, views: Sequence[View], points: SparsePoints, up: np.ndarray) -> _Seen:
+        near = _most(points.positions)
+        axes = scene_axes(near, positions(view.camera for view in views), up)
+        return cls(near, Sightlines.of(views, points), axes)
+
+
+def _anywhere(surface: Triangles, seen: _Seen) -> list[Candidate]:
+    """Alignments in any orientation and of any scale, the best first."""
+    samples, triangle = surface.samples(_SAMPLES)
+    search, fit = _Search.of(samples, seen), _Fit.of(surface, samples, seen)
+    return fit.ranked(fit.polished(search.starts(shell_axes(surface.normals[triangle]), seen.axes), search.cell))
+
+
+def _near(tags: GeoTags, surface: Triangles, seen: _Seen) -> list[Candidate]:
+    """Upright alignments within 30 m of geo-tags, the best first.
+
+    Of those that fit well, only ones about as near as the nearest are left: all tags may have a common bias.
+    """
+    scales = tags.scales(seen.axes[1])
+    reach = _NEAR + scales[1] * np.percentile(seen.sight.lengths, 95)
+    low, high = np.percentile(tags.places, [10, 90], axis=0) + reach * np.array([[-1], [1]])  # a few may be far off
+    part = surface.within(low, high)
+    if not len(part.faces):
+        return []
+    samples, triangle = part.samples(_SAMPLES)
+    inside = ((samples[:, :2] > low) & (samples[:, :2] < high)).all(axis=1)
+    if not inside.any():
+        return []
+    search, fit = _Search.of(samples[inside], seen, scales, tags), _Fit.of(part, samples[inside], seen)
+    turns = shell_axes(part.normals[triangle[inside]], up=np.array([0.0, 0.0, 1.0]))
+    starts = [start for start in search.starts(turns, seen.axes) if tags.apart(start.survey_from_scene) < _NEAR]
+    found = fit.polished(starts, search.cell)
+    apart = [tags.apart(candidate.survey_from_scene) for candidate in found]
+    least = AMBIGUOUS * max((candidate.score for candidate in found), default=0.0)
+    nearest = min((off for off, each in zip(apart, found, strict=True) if each.score >= least), default=0.0)
+    return fit.ranked([each for off, each in zip(apart, found, strict=True) if off <= nearest + REACH])
 
 
 @dataclass(frozen=True)
@@ -133,22 +165,39 @@ class _Search:
         points: SfM points.
         empty: points in the air that sightlines pass through.
         cell: length of a cell in metres.
+        scales: least and greatest scale.
+        tags: geo-tags that cameras are near, if there are any.
     """
 
     samples: np.ndarray
     points: np.ndarray
     empty: np.ndarray
     cell: float
+    scales: tuple[float, float]
+    tags: GeoTags | None
 
     @classmethod
-    def of(cls, samples: np.ndarray, points: np.ndarray, sight: Sightlines) -> _Search:
+    def of(
+        cls,
+        samples: np.ndarray,
+        seen: _Seen,
+        scales: tuple[float, float] = (0.0, np.inf),
+        tags: GeoTags | None = None,
+    ) -> _Search:
         size = np.ptp(samples, axis=0)
         cell = float(np.prod(np.maximum(size, 0.05 * size.max())) / _CELLS) ** (1 / 3)
         rng = np.random.default_rng(0)
+        sight, points = seen.sight, seen.points
         share = rng.uniform(0.0, 0.95, (12, len(sight.points), 1))
         empty = (sight.origins + share * (sight.points - sight.origins)).reshape(-1, 3)
         low, high = points.min(0), points.max(0)
-        return cls(samples, points, empty[((empty > low) & (empty < high)).all(axis=1)], cell)
+        inside = ((empty > low) & (empty < high)).all(axis=1)
+        return cls(samples, points, empty[inside], cell, scales, tags)
+
+    def starts(self, shell_axes: Sequence[np.ndarray], scene_axes: np.ndarray) -> list[Candidate]:
+        """The best candidates of all orientations: those that turn the scene's axes to some of the shell's."""
+        turns = track([to.T @ scene_axes for to in shell_axes], "Trying orientations", len(shell_axes))
+        return [start for turn in turns for start in self.placed(turn)]
 
     def placed(self, turn: np.ndarray) -> Iterator[Candidate]:
         """The best candidates of an orientation: the rotation from the scene's axes to the survey's."""
@@ -157,7 +206,8 @@ class _Search:
         extent = np.maximum(np.ptp(boxes[0], axis=0), 0.1 * self.cell)  # a shell may be one flat wall
         seen = np.ptp(boxes[1], axis=0)
         ratios = np.sort(extent / np.maximum(seen, max(_THINNEST * seen.max(), 1e-9)))
-        lowest, highest = 0.5 * ratios[0], 1.6 * ratios[2]
+        smaller = 0.5 if self.tags is None else 0.15  # a district is also higher than the building that is seen of it
+        lowest, highest = np.clip([smaller * ratios[0], 1.6 * ratios[2]], *self.scales)
         steps = int(np.log(highest / lowest) / np.log(_SCALE_STEP)) + 1
         first = np.floor(self.samples.min(0) / self.cell).astype(int) - 1
         shell = _grid(self.samples, first, np.floor(self.samples.max(0) / self.cell).astype(int) + 2, self.cell)
@@ -178,11 +228,16 @@ class _Search:
             weighted = occupied / (occupied.sum() + 0.5 * shell.sum()) - _EMPTY * free / (free.sum() + shell.sum())
             spectrum = np.asarray(rfftn(weighted.astype(np.float32), shape))
             score = np.asarray(irfftn(spectra[shape] * np.conj(spectrum), shape))
+            # Shifts before the first are at the end.
+            shifts = [np.r_[:n, n - m : 0] for n, m in zip(shell.shape, shape, strict=True)]
+            moves = [(first[k] - low[k] + shifts[k]) * self.cell for k in range(3)]
+            if self.tags is not None:
+                east, north = self.tags.shift(scale * turn)
+                score[np.hypot.outer(moves[0] - east, moves[1] - north) > _NEAR] = -np.inf
             for index, value in _peaks(score):
-                shift = np.array([i if i < n else i - m for i, n, m in zip(index, shell.shape, shape, strict=True)])
                 similarity = np.eye(4)
                 similarity[:3, :3] = scale * turn
-                similarity[:3, 3] = (first + shift - low) * self.cell
+                similarity[:3, 3] = [moves[k][i] for k, i in enumerate(index)]
                 yield Candidate(similarity, value)
 
 
@@ -199,6 +254,8 @@ def _peaks(score: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
     """The largest values, a few cells apart, and their indices."""
     for _ in range(_PEAKS):
         index = tuple(int(i) for i in np.unravel_index(score.argmax(), score.shape))
+        if score[index] == -np.inf:
+            return
         yield index, float(score[index])
         score[tuple(slice(max(i - 2, 0), i + 3) for i in index)] = -np.inf
 
@@ -214,10 +271,46 @@ class _Fit:
         spread: some points of the shell, by which it is seen how far candidates are apart.
     """
 
-    surface: ShellSurface
+    surface: Triangles
     points: np.ndarray
     sight: Sightlines
     spread: np.ndarray
+
+    @classmethod
+    def of(cls, surface: Triangles, samples: np.ndarray, seen: _Seen) -> _Fit:
+        return cls(surface, np.random.default_rng(0).permutation(seen.points), seen.sight, samples[:200])
+
+    def polished(self, starts: Sequence[Candidate], cell: float) -> list[Candidate]:
+        """The best candidates, refined ever more finely.
+
+        Args:
+            starts: what to start from.
+            cell: how far they may be off, in metres.
+        """
+        starts = self.distinct(starts, _MEASURED, cell)
+        measured = track(starts, "Measuring candidates", len(starts))
+        starts = [self.measured(start.survey_from_scene, _ROUGH) for start in measured]
+        for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
+            starts = self.distinct(starts, count, apart * cell)
+            starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
+            hopeful = track(starts, f"Refining candidates, round {number}", len(starts))
+            starts = [found for s in hopeful for found in self.refined(s, few, reach * cell, _COARSE, steps)]
+        starts, polished = self.distinct(starts, _POLISHED, self.different(starts)), []
+        for start in track(starts, "Refining the best", len(starts)):
+            reach = 2 * _COARSE * self.sight.distance(start.survey_from_scene)
+            polished += self.refined(start, _MANY, reach, _FIT, 30)
+        return [candidate for candidate in polished if candidate.score > 0]
+
+    def ranked(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Candidates that differ, the best first, and how far the others are from it."""
+        kept = self.distinct(candidates, _POLISHED, self.different(candidates))
+        others = (replace(other, displacement=self.displacement(kept[0], other)) for other in kept[1:])
+        return [*kept[:1], *others]
+
+    def different(self, candidates: Sequence[Candidate]) -> float:
+        """Metres from which candidates differ: the farther away the cameras are, the more."""
+        distances = [_DIFFERENT_FROM_AFAR * self.sight.distance(each.survey_from_scene) for each in candidates[:1]]
+        return max([_DIFFERENT, *distances])
 
     def measured(self, similarity: np.ndarray, tolerance: float) -> Candidate:
         return Candidate(similarity, self.sight.agreement(self.surface, similarity, tolerance))

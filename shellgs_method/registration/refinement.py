@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.geometry.triangles import Triangles
 
 FINAL_GATE = 0.05
 """Metres from the shell beyond which a point has no weight in the last steps: SfM points on a wall scatter by 1 to 3
@@ -82,7 +82,7 @@ class Refinement:
 
 
 def refine(
-    surface: ShellSurface,
+    surface: Triangles,
     points: Float64[np.ndarray, "N 3"],
     survey_from_scene: Float64[np.ndarray, "4 4"],
     reach: float,
@@ -127,7 +127,7 @@ def refine(
 
 
 def _solve(
-    surface: ShellSurface, points: np.ndarray, gate: float, relative: bool
+    surface: Triangles, points: np.ndarray, gate: float, relative: bool
 ) -> tuple[Evidence, np.ndarray, np.ndarray]:
     """One step: its evidence, the similarity to apply, and the mask of points within the gate."""
     closest = surface.closest(points)

@@ -16,9 +16,9 @@ from jaxtyping import Float64, Int64
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import in_view, world_rays
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.geometry.spread import spread
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.geometry.triangles import Triangles
 
 _VIEWS, _PER_VIEW = 10, 300
 _COLUMNS = 14  # cells along the longer side of an image
@@ -70,12 +70,16 @@ class Sightlines:
             first += len(rays)
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
+    @property
+    def lengths(self) -> Float64[np.ndarray, " N"]:
+        """Length of each sightline in the scene's units."""
+        return np.linalg.norm(self.points - self.origins, axis=1)
+
     def distance(self, similarity: Float64[np.ndarray, "4 4"]) -> float:
         """Median length of the sightlines in metres."""
-        ends = (transformed(each, similarity) for each in (self.origins, self.points))
-        return float(np.median(np.linalg.norm(np.subtract(*ends), axis=1)))
+        return scale_of(similarity) * float(np.median(self.lengths))
 
-    def agreement(self, surface: ShellSurface, similarity: Float64[np.ndarray, "4 4"], tolerance: float) -> float:
+    def agreement(self, surface: Triangles, similarity: Float64[np.ndarray, "4 4"], tolerance: float) -> float:
         """Harmonic mean of the share of points on the visible shell, and of the visible shell that has such points.
 
         Args:
