@@ -186,6 +186,8 @@ class _Search:
     ) -> _Search:
         size = np.ptp(samples, axis=0)
         cell = float(np.prod(np.maximum(size, 0.05 * size.max())) / _CELLS) ** (1 / 3)
+        if tags is not None:  # a small part of a district is seen
+            cell = float(np.clip(1.0, cell / 1.8, cell))
         rng = np.random.default_rng(0)
         sight, points = seen.sight, seen.points
         share = rng.uniform(0.0, 0.95, (12, len(sight.points), 1))

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from alignments import AXES, TRUTH, degrees_of, displaced, error
 from PIL import ExifTags, Image
 from scenes import views_of
+from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -21,7 +23,8 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.similarity import scale_of, transformed
-from shellgs_method.registration import proposal
+from shellgs_method.geometry.triangles import stacked
+from shellgs_method.registration import align, proposal
 from shellgs_method.registration.align import PROPOSAL, place_by_guess
 from shellgs_method.registration.geotags import GeoTags
 from shellgs_method.registration.orientations import scene_axes, shell_axes
@@ -133,10 +136,49 @@ def test_geo_tags_with_a_bias_leave_a_building_and_its_neighbour_ambiguous(tmp_p
 
 
 def test_geo_tags_that_no_place_agrees_with_are_told(tmp_path, mesh, views, points):
-    """As of a building elsewhere, and of one in a model of a whole district, in which it is too small to be found."""
     shown = tagged(tmp_path, views, 1.0, bias=60.0)
     placement = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832"))
-    assert placement.history[1].endswith("crop a shell of a whole district to what photographs show.")
+    assert placement.history[1].endswith("check that the building and --crs are the right ones.")
+
+
+def district_of(mesh: ShellMesh, metres: float) -> ShellMesh:
+    """The shell in the midst of houses along streets, which have another heading."""
+    random, middle = np.random.default_rng(0), mesh.bounds.mean(axis=0)[:2]
+    parts = [(mesh.vertices, mesh.faces)]
+    heading = Rotation.from_euler("z", 25, degrees=True)
+    for place in np.stack(np.meshgrid(*2 * [np.arange(-metres / 2, metres / 2, 28)]), axis=-1).reshape(-1, 2):
+        if np.linalg.norm(place) > 35:
+            house = trimesh.creation.box([*random.uniform(9, 20, 2), random.uniform(6, 18)])
+            there = [*(middle + heading.apply([*place, 0])[:2]), mesh.bounds[0, 2] - house.bounds[0, 2]]
+            parts.append((heading.apply(house.vertices) + there, house.faces))
+    return ShellMesh(*stacked(parts))
+
+
+@pytest.mark.slow
+def test_geo_tags_find_a_building_in_a_model_of_its_district(tmp_path, mesh, views, points):
+    """All of it at once, its cells are metres wide, and others of its thousands of walls fit as well."""
+    district = district_of(mesh, 600)
+    placement = place_by_guess(
+        district, tagged(tmp_path, views, 3.0, bias=6.0), points, unplaced("s.ply", crs="EPSG:25832")
+    )
+    assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
+    assert not any("Ambiguous" in sentence for sentence in placement.history)
+
+
+def test_geo_tags_bound_the_scale_and_the_shift(tmp_path, views, surface, survey_from_scene):
+    tags = GeoTags.of(tagged(tmp_path, views, 3.0), "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    least, greatest = tags.scales(SCENE_FROM_BUILDING[:3, 2])
+    assert least < scale_of(survey_from_scene) < greatest
+    shift = tags.shift(survey_from_scene[:3, :3])
+    np.testing.assert_allclose(shift, survey_from_scene[:2, 3], atol=3.0)
+
+
+def test_geo_tags_that_nothing_uses_are_told(tmp_path, mesh, views, points, monkeypatch):
+    monkeypatch.setattr(align, "propose", lambda *_: [Candidate(np.eye(4), 1.0)])
+    told = "The photographs have geo-tags: if --crs names the shell's system, the search is near them."
+    assert told in place_by_guess(mesh, tagged(tmp_path, views, 3.0), points, unplaced("s.ply")).history
+    assert told not in place_by_guess(mesh, views, points, unplaced("s.ply")).history
 
 
 def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
