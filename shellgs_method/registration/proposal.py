@@ -137,8 +137,9 @@ def _near(tags: GeoTags, surface: Triangles, seen: _Seen) -> list[Candidate]:
     Of those that fit well, only ones about as near as the nearest are left: all tags may have a common bias.
     """
     scales = tags.scales(seen.axes[1])
-    reach = _NEAR + scales[1] * np.percentile(seen.sight.lengths, 95)
-    low, high = np.percentile(tags.places, [10, 90], axis=0) + reach * np.array([[-1], [1]])  # a few may be far off
+    away = np.linalg.norm(seen.sight.points - np.median(tags.cameras, axis=0), axis=1)
+    reach = _NEAR + scales[1] * np.percentile(away, 95)
+    low, high = np.median(tags.places, axis=0) + reach * np.array([[-1], [1]])  # by the median: some may be far off
     part = surface.within(low, high)
     if not len(part.faces):
         return []
