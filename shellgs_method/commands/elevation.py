@@ -26,7 +26,7 @@ def elevation(
         output: Folder. If not set: elevation beside the config.
         pixel: Size of a pixel in metres. If not set: a third of the photographs' on the facade, or 5 mm.
     """
-    output = output or config.with_name("elevation")
+    output = output or config.parent / "elevation"
     check_output_folder(output)  # before views are rendered for minutes
     from shellgs_method.export.elevation import (
         MARGIN,

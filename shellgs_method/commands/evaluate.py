@@ -36,7 +36,7 @@ def evaluate(
     from shellgs_method.compare.measure import write_metrics
     from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, against_truth, rich_table
 
-    output_path = output_path or config.with_name("metrics.json")
+    output_path = output_path or config.parent / "metrics.json"
     measured = write_metrics(config, output_path, holdout, renders, points)
     metrics, truth = measured["results"], against_truth(measured["results"])
     rows = {"against the shell": metrics, "against the ground truth": truth} if truth else {"run": metrics}

@@ -35,7 +35,7 @@ def mesh(
     from shellgs_method.export.runs import TrainedRun, mesh_errors
     from shellgs_method.geometry.decimation import decimated_mesh
 
-    output = output or config.with_name("mesh.ply")
+    output = output or config.parent / "mesh.ply"
     check_mesh_format(output)
     run = TrainedRun.load(config)
     surface = decimated_mesh(run.surface(margin, voxel), faces)

@@ -39,7 +39,7 @@ def splats(
     from shellgs_method.files.splats import Y_UP, Splats, check_splats_format, encoded, write_splats
     from shellgs_method.runs.run_folder import open_run
 
-    output = output or config.with_name("splats.ply")
+    output = output or config.parent / "splats.ply"
     check_splats_format(output)
     check_splats_format(output, discs=getattr(open_run(config).pipeline.model, "primitive", None) == "2d")
     run = TrainedRun.load(config)

@@ -124,6 +124,13 @@ def test_a_folder_in_place_of_a_config_is_called_one(tmp_path: Path):
         load_config(tmp_path)
 
 
+@pytest.mark.parametrize("command", ["splats", "mesh", "elevation", "evaluate"])
+def test_the_folder_of_a_run_in_place_of_its_config_is_called_one(tmp_path, shellgs, monkeypatch, command):
+    """Their outputs are beside the config, and pathlib finds no name beside ``.``."""
+    monkeypatch.chdir(tmp_path)
+    assert shellgs(command, ".") == "refused: shellgs: . is a folder: name the config.yml of a trained run"
+
+
 # Its scene
 
 
