@@ -309,11 +309,13 @@ def test_a_solid_that_links_to_the_surfaces_adds_nothing(tmp_path: Path):
     assert len(read.faces) == len(alone.faces)
 
 
-def test_a_hollow_in_a_solid_of_a_citygml_is_left_out(tmp_path: Path, caplog):
-    member = "<gml:CompositeSurface><gml:surfaceMember>{}</gml:surfaceMember></gml:CompositeSurface>"
-    outer, inner = (member.format(made.polygon_gml(face.rings)) for face in moved(house())[:2])
+@pytest.mark.parametrize("inner", ["<gml:interior>{}</gml:interior>", '<gml:interior xlink:href="#wall"/>'])
+def test_a_hollow_in_a_solid_of_a_citygml_is_left_out(tmp_path: Path, caplog, inner: str):
+    member = "<gml:CompositeSurface{}><gml:surfaceMember>{}</gml:surfaceMember></gml:CompositeSurface>"
+    one, other = (made.polygon_gml(face.rings) for face in moved(house())[:2])
+    outer = member.format(' gml:id="wall"', one)
     solid = "<bldg:lod3Solid><gml:Solid><gml:exterior>{}</gml:exterior>{}</gml:Solid></bldg:lod3Solid>"
-    whole, hollow = solid.format(outer, ""), solid.format(outer, f"<gml:interior>{inner}</gml:interior>")
+    whole, hollow = solid.format(outer, ""), solid.format(outer, inner.format(member.format("", other)))
     read = [read_geometry(save(tmp_path / "a.gml", made.citygml(text))) for text in (whole, hollow)]
     assert len(read[0].faces) == len(read[1].faces)
     assert "1 hollow in a solid" in caplog.text

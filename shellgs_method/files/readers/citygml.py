@@ -170,11 +170,11 @@ class _Model:
                 yield rings
         elif name == "ImplicitGeometry":
             yield from self._implicit(element, depth)
+        elif name == "interior":  # of a solid: those of polygons are rings
+            self.missing[HOLLOW] += 1
         elif element.get(_HREF) is not None:
             if (target := self.linked(element)) is not None:
                 yield from self._polygons(target, depth + 1)
-        elif name == "interior":  # of a solid: those of polygons are rings
-            self.missing[HOLLOW] += 1
         else:
             for child in element:
                 yield from self._polygons(child, depth + 1)
