@@ -45,7 +45,7 @@ REPORT = Path("shell/report")
 
 _RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
 _ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
-_LOCAL = 10_000  # units from the origin, within which a shell is not in a coordinate reference system
+_LOCAL = 10_000  # metres from the origin, within which a shell is not in a coordinate reference system
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
 
@@ -280,11 +280,12 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     tags = GeoTags.of(views, unplaced.crs, surface.survey_from_shell) if unplaced.crs else None
     best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
+    is_far = np.abs(mesh.centre).max() * unplaced.metres_per_shell_unit > _LOCAL
     if tags is not None:
         off = tags.apart(best.survey_from_scene)
         said = ": it agrees with none, so check that the building and --crs are the right ones" if off >= REACH else ""
         history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
-    elif not unplaced.crs and has_geo_tags(views) and np.abs(mesh.centre).max() > _LOCAL:
+    elif is_far and not unplaced.crs and has_geo_tags(views):
         history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."

@@ -189,6 +189,18 @@ def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
     assert not any("Ambiguous" in sentence for sentence in placement.history)
 
 
+@pytest.mark.parametrize("metres_per_unit", [1.0, 0.001])
+def test_geo_tags_are_told_of_if_a_shell_is_as_far_as_in_a_system(
+    tmp_path, mesh, views, points, monkeypatch, metres_per_unit
+):
+    """A building in millimetres has ten thousands, too, without a system that --crs could name."""
+    monkeypatch.setattr("shellgs_method.registration.align.propose", lambda *_: [Candidate(np.eye(4), score=0.9)])
+    moved = ShellMesh(mesh.vertices - mesh.vertices.min(0) + 12_000, mesh.faces)
+    alignment = replace(unplaced("s.ply"), metres_per_shell_unit=metres_per_unit)
+    told = place_by_guess(moved, tagged(tmp_path, views, 3.0), points, alignment).history[1:]
+    assert len(told) == (metres_per_unit == 1.0)
+
+
 def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_path, shellgs):
     """Of two facades that are the same, whose scan is in UTM 32."""
     scene, scan = tmp_path / "scene", tmp_path / "twins.ply"
