@@ -281,7 +281,7 @@ def test_a_flat_wall_is_searched_for_in_about_its_size(views):
     samples, _ = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))).samples(2000)
     seen = samples + random.normal(0, 0.01, samples.shape)
     sight: Any = SimpleNamespace(points=seen, origins=seen - [0.0, 8.0, 0.0])
-    found = proposal._Search.of(samples, seen, sight).placed(np.eye(3))
+    found = proposal._Search.of(samples, proposal._Seen(seen, sight, np.eye(3))).placed(np.eye(3))
     best = max(found, key=lambda candidate: candidate.score).survey_from_scene
     np.testing.assert_allclose(best[:3, :3], np.eye(3), atol=0.1)
     np.testing.assert_allclose(best[:3, 3], 0, atol=0.5)
@@ -291,7 +291,7 @@ def test_points_exactly_in_a_plane_are_placed_on_a_shell_with_depth(mesh):
     samples, _ = ShellSurface(mesh).samples(5000)
     wall = samples[np.abs(samples[:, 1] - np.median(samples[:, 1])) < 0.1] * [1, 0, 1] / 3
     sight: Any = SimpleNamespace(points=wall, origins=wall - [0.0, 3.0, 0.0])
-    found = list(proposal._Search.of(samples, wall, sight).placed(np.eye(3)))
+    found = list(proposal._Search.of(samples, proposal._Seen(wall, sight, np.eye(3))).placed(np.eye(3)))
     assert min(abs(scale_of(candidate.survey_from_scene) / 3 - 1) for candidate in found) < 0.03
     assert len(found) < 3 * 150
 
