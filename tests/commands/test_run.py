@@ -151,6 +151,7 @@ def test_a_run_is_advised_once_to_pick_points_and_only_where_the_alignment_is_re
     assert len(opened) == 1
 
 
+@pytest.mark.usefixtures("ends_with_the_cast")
 def test_photographs_are_captured_where_there_are_no_cameras_and_again_if_they_are_others(inputs, shellgs, monkeypatch):
     photographs, shell, matrix = inputs
     cameras, calls = Path("scene/transforms.json"), []
