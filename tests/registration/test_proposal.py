@@ -135,6 +135,7 @@ def test_geo_tags_with_a_bias_leave_a_building_and_its_neighbour_ambiguous(tmp_p
     assert any(f"Ambiguous: an alignment {apart:.1f} m from this one" in sentence for sentence in placement.history)
 
 
+@pytest.mark.slow
 def test_geo_tags_that_no_place_agrees_with_are_told(tmp_path, mesh, views, points):
     shown = tagged(tmp_path, views, 1.0, bias=60.0)
     placement = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832"))
