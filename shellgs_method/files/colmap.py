@@ -234,14 +234,12 @@ def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -
             file.write(struct.pack("<I7dI", number, *image.quaternion, *image.translation, image.camera))
             name, features = image.name.encode(errors="surrogateescape"), image.features
             file.write(name + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
-    points = model.points
+    points, numbers = model.points, model.points.ids.astype(np.uint64)
     observed = np.stack([points.tracks["image"], points.tracks["keypoint"]], axis=1).astype("<u4")
     tracks = np.split(observed, np.searchsorted(points.tracks["point"], np.arange(1, len(points.ids))))
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(points.ids)))
-        for k, (number, track) in enumerate(
-            zip(points.ids.astype(np.uint64), tracks, strict=False)
-        ):  # one of no points
+        for k, (number, track) in enumerate(zip(numbers, tracks, strict=False)):  # one of no points
             file.write(struct.pack("<Q3d3Bd", number, *points.positions[k], *points.colours[k], errors[k]))
             file.write(struct.pack("<Q", len(track)) + track.tobytes())
 

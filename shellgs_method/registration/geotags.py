@@ -49,7 +49,7 @@ class GeoTags:
         """
         from pyproj import CRS
 
-        tagged = [(view, place) for view in views if (place := _geo_tag(view.image))]
+        tagged = _tagged(views)
         if not tagged:
             return None
         degrees = np.array([place for _, place in tagged], dtype=np.float64)
@@ -87,7 +87,12 @@ class GeoTags:
 
 def has_geo_tags(views: Sequence[View]) -> bool:
     """Whether enough photographs for :class:`GeoTags` have one."""
-    return sum(_geo_tag(view.image) is not None for view in views) >= _LEAST
+    return len(_tagged(views)) >= _LEAST
+
+
+def _tagged(views: Sequence[View]) -> list[tuple[View, tuple[float, float]]]:
+    """Photographs that have a geo-tag, with their longitude and latitude."""
+    return [(view, place) for view in views if (place := _geo_tag(view.image))]
 
 
 def _geo_tag(path: Path) -> tuple[float, float] | None:

@@ -70,14 +70,9 @@ class Sightlines:
             first += len(rays)
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    @property
-    def lengths(self) -> Float64[np.ndarray, " N"]:
-        """Length of each sightline in the scene's units."""
-        return np.linalg.norm(self.points - self.origins, axis=1)
-
     def distance(self, similarity: Float64[np.ndarray, "4 4"]) -> float:
         """Median length of the sightlines in metres."""
-        return scale_of(similarity) * float(np.median(self.lengths))
+        return scale_of(similarity) * float(np.median(np.linalg.norm(self.points - self.origins, axis=1)))
 
     def agreement(self, surface: Triangles, similarity: Float64[np.ndarray, "4 4"], tolerance: float) -> float:
         """Harmonic mean of the share of points on the visible shell, and of the visible shell that has such points.
