@@ -341,16 +341,15 @@ class _Fit:
         best = sorted(candidates, key=lambda candidate: -candidate.score)
         # Where the shell is in the scene, relative to the size of it there: shells of all scales are compared alike.
         placed = [transformed(self.spread, np.linalg.inv(candidate.survey_from_scene)) for candidate in best]
-        metres = [scale_of(candidate.survey_from_scene) for candidate in best]
+        middles = np.array([each.mean(axis=0) for each in placed])  # no farther apart than the points in the mean
         kept: list[int] = []
         for k in range(len(best)):
-            if kept:
-                moved = np.linalg.norm(np.stack([placed[other] for other in kept]) - placed[k], axis=2).mean(axis=1)
-                if (moved * metres[k] <= apart).any():
-                    continue
-            kept.append(k)
-            if len(kept) == count:
-                break
+            reach = apart / scale_of(best[k].survey_from_scene)
+            near = np.array(kept, int)[np.linalg.norm(middles[kept] - middles[k], axis=1) <= reach]
+            if all(np.linalg.norm(placed[other] - placed[k], axis=1).mean() > reach for other in near):
+                kept.append(k)
+                if len(kept) == count:
+                    break
         return [best[k] for k in kept]
 
     def displacement(self, one: Candidate, other: Candidate) -> float:
