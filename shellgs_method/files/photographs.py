@@ -194,12 +194,12 @@ def is_turned(view: View, image: Image.Image, path: Path) -> bool:
 
 
 def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
-    """Report photographs that have nearly the size or the shape of their cameras, but not quite.
+    """Report photographs that are larger than their cameras, or have nearly their size or shape, but not quite.
 
     Nobody scales by 2 %, or one side by another factor. COLMAP's undistorted photographs have other sizes than the
     originals, often by less, and other shapes.
     """
-    other = []
+    other, larger = [], []
     for view in views:
         with suppress(SceneError):  # of a missing or damaged one, which is raised where it is used
             size, calibrated = np.array(upright_size(view)), np.array(_calibrated_size(view))
@@ -209,6 +209,16 @@ def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
             scale = size[longer] / calibrated[longer]
             if nearly or np.abs(size - scale * calibrated).max() > _ROUNDED * max(scale, 1):
                 other.append((view, size))
+            elif scale > 1 + _SCALED:
+                larger.append((view, size))
+    if larger:
+        view, (width, height) = larger[0]
+        across, down = _calibrated_size(view)
+        notice(
+            f"{len(larger)} photographs of {scene} are larger than their cameras, and are used at the size of these: "
+            f"{view.name} is {width}x{height} pixels, its camera {across}x{down}. To use all pixels, multiply the "
+            f"cameras' sizes, focal lengths and principal points by {width / across:.4g}."
+        )
     if other:
         view, (width, height) = other[0]
         of = "{}x{}".format(*_calibrated_size(view))

@@ -505,6 +505,18 @@ def test_photographs_smaller_than_their_cameras_are_not_enlarged(scene, k1):
     np.testing.assert_allclose(from_camera(view, to_camera(view, pixels)), pixels, atol=1e-3)
 
 
+def test_photographs_larger_than_their_cameras_are_told_of(scene, caplog):
+    parse(scene)
+    assert "larger" not in caplog.text
+    for path in (scene / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((4 * image.width, 4 * image.height)).save(path)
+    parse(scene)
+    assert "10 photographs" in caplog.text
+    assert "frame_00001.png is 192x128 pixels, its camera 48x32" in caplog.text
+    assert "by 4." in caplog.text
+
+
 @pytest.mark.parametrize(("factor", "width", "height"), [(0.5, 24, 16), (0.4, 19, 13)])
 def test_a_scaled_dataset_has_photographs_maps_and_cameras_of_one_size(pristine_scene, factor, width, height):
     dataset, whole = FacadeDataset(parse(pristine_scene), factor), FacadeDataset(parse(pristine_scene))
