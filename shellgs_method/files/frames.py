@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -69,12 +69,14 @@ class Recording:
         applied: rigid motion from the scene's frame to the one that nerfstudio would read.
         listed: names of photographs by split, where the files list them; else the interval decides.
         orientation: orientation method for the viewer, if the files set one.
+        bad: names of further photographs that the files mark as bad.
     """
 
     frames: Sequence[Frame]
     applied: Float64[np.ndarray, "4 4"]
     listed: Mapping[str, set[str]] = field(default_factory=dict)
     orientation: str | None = None
+    bad: Set[str] = frozenset()
 
 
 def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping[str, Any], where: str) -> Frame:

@@ -8,6 +8,7 @@ import unicodedata
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+from urllib.parse import unquote
 
 from pi_heif import register_heif_opener
 from PIL import Image
@@ -55,7 +56,7 @@ class NamedFiles:
     """The files of a scene that one of its files names, whatever the system, machine and folder it was written on.
 
     A path is taken as it is written if a file is there. Else Windows' separators, other cases, compositions and
-    encodings of letters and a missing or another suffix are understood, and leading folders that the scene does not
+    encodings of letters, URLs' escapes and a missing or another suffix are understood, and leading folders that the scene does not
     have are dropped, until exactly one file fits. Names that are no UTF-8 have surrogates for what is none.
     """
 
@@ -141,7 +142,7 @@ class NamedFiles:
 
 
 def _alike(name: str, written: str) -> bool:
-    return name == written or folded(name) == folded(written) or _in_code_page(name, written)
+    return folded(name) in (folded(written), folded(unquote(written))) or _in_code_page(name, written)
 
 
 def _in_code_page(name: str, written: str) -> bool:

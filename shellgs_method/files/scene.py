@@ -93,13 +93,14 @@ class SceneLayout(ScenePaths):
         there = [
             p for folder in sorted(folders) for p in photographs_in(folder, deep=folder == inner) if p not in masks
         ]
-        without = [path.relative_to(self.data).as_posix() for path in there if path not in used]
-        if without:
-            shown = ", ".join(without[:3]) + (", …" if len(without) > 3 else "")
-            notice(
-                f"{len(without)} of {len(there)} photographs of {self.data} are not in {cameras}, and are left out: "
-                f"{shown}."
-            )
+        without = {path.relative_to(self.data).as_posix() for path in there if path not in used}
+        for names, why in ((without - recording.bad, "not in"), (recording.bad, "marked as bad in")):
+            if names:
+                shown = ", ".join(sorted(names)[:3]) + (", …" if len(names) > 3 else "")
+                notice(
+                    f"{len(names)} of {len(there)} photographs of {self.data} are {why} {cameras}, and are left out: "
+                    f"{shown}."
+                )
         names = {frame.name for frame in recording.frames}
         unlisted = names.difference(*recording.listed.values()) if recording.listed else set()
         if unlisted:

@@ -62,8 +62,13 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
             "written, so a --matrix must map to these."
         )
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
-    frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
-    named = {split: _names(meta.get(f"{split}_filenames", []), files, path) for split in _SPLITS}
+    bad = _names([each.get("file_path") for each in listed_frames if _is_bad(each)], files, path)
+    frames = [
+        _frame(files, each, meta, applied, f"{path}, frame {k}")
+        for k, each in enumerate(listed_frames, start=1)
+        if not _is_bad(each)
+    ]
+    named = {split: _names(meta.get(f"{split}_filenames", []), files, path) - bad for split in _SPLITS}
     listed = {split: names for split, names in named.items() if names}  # an empty list says that the split has none
     files.tell_what_is_elsewhere()
     _tell_of_unread((meta, *listed_frames), path)
@@ -72,7 +77,7 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
     if np.array_equal(applied[:3], _METASHAPE):
         _tell_of_metashape([each.lens for each in frames if each.lens and not each.lens.fisheye], path)
-    return Recording(in_order(frames, str(path)), applied, listed, orientation)
+    return Recording(in_order(frames, str(path)), applied, listed, orientation, bad)
 
 
 def _tell_of_unread(sources: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -183,6 +188,11 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
     if not entry.get("mask_path"):
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))
+
+
+def _is_bad(entry: Any) -> bool:
+    """Whether ScanNet++ marks a frame as blurred or without a pose."""
+    return isinstance(entry, dict) and entry.get("is_bad") is True
 
 
 def _in_pixels(lens: dict[str, Any], where: str, path: Path) -> dict[str, Any]:

@@ -505,6 +505,24 @@ def test_photographs_smaller_than_their_cameras_are_not_enlarged(scene, k1):
     np.testing.assert_allclose(from_camera(view, to_camera(view, pixels)), pixels, atol=1e-3)
 
 
+def test_frames_that_are_marked_as_bad_are_left_out(scene, caplog):
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame, bad in zip(meta["frames"], [False, True, *[False] * 8], strict=True):
+        frame["is_bad"] = bad
+    meta["frames"][1]["transform_matrix"] = np.full((4, 4), np.nan).tolist()
+    lists = {
+        "train_filenames": [f["file_path"] for f in meta["frames"]][:8],
+        "val_filenames": ["images/frame_00010.png"],
+    }
+    path.write_text(json.dumps(meta | lists))
+    assert "frame_00002.png" not in names(parse(scene))
+    assert len(names(parse(scene))) == 7
+    assert "1 of 10 photographs" in caplog.text
+    assert "marked as bad in transforms.json" in caplog.text
+    assert "not in transforms.json" not in caplog.text
+
+
 def test_photographs_larger_than_their_cameras_are_told_of(scene, caplog):
     parse(scene)
     assert "larger" not in caplog.text
@@ -965,6 +983,7 @@ SPELLINGS: dict[str, Callable[[str], str]] = {
     "only the name": lambda path: path.removeprefix("images/"),
     "other working folder": lambda path: f"../shoot/{path}",
     "another suffix": lambda path: path.replace(".png", ".HEIC"),
+    "URL": lambda path: path.replace("_", "%5F"),
     "case": lambda path: path.replace("images", "Images").replace(".png", ".PNG"),
     "all": lambda path: "c:\\" + path.upper().replace("/", "\\").removesuffix(".PNG"),
 }
