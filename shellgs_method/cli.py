@@ -67,3 +67,7 @@ def main() -> None:
 def _paragraphs(command: Callable) -> str:
     """A command's docstring with a line for each paragraph: tyro keeps line breaks, and narrow terminals add others."""
     return re.sub(r"(?<=\S)\n(?: {8})?(?=\S)", " ", inspect.getdoc(command) or "")
+
+
+if __name__ == "__main__":
+    main()

@@ -88,8 +88,16 @@ def check_output(path: Path) -> None:
     _check_writable(above, path, "name a file elsewhere")
 
 
+_OF_FILES = (
+    *(".glb", ".html", ".jpg", ".json", ".md", ".obj", ".pdf", ".ply", ".png", ".sdf", ".tif", ".tiff", ".urdf"),
+    *(".usd", ".usda", ".usdc", ".usdz", ".xml", ".zip"),
+)
+"""Suffixes that only files have."""
+
+
 def check_output_folder(path: Path) -> None:
-    """Refuse an output folder that is a file or lies below one, or that cannot be written to, before the work starts.
+    """Refuse an output folder that is a file or named like one, that lies below one, or that cannot be written to,
+    before the work starts.
 
     Raises:
         SceneError: names the file, or the folder that is not writable.
@@ -97,6 +105,8 @@ def check_output_folder(path: Path) -> None:
     there = _existing(path)
     if not there.is_dir():
         raise SceneError(f"{there} is a file: name a folder to write to")
+    if there != path and path.suffix.lower() in _OF_FILES:
+        raise SceneError(f"{path} would be a folder of several files: name it without {path.suffix}")
     _check_writable(there, path, "name a folder elsewhere")
 
 

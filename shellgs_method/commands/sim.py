@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from shellgs_method.commands.common import console, required
+from shellgs_method.errors import check_output_folder
 from shellgs_method.sim.settings import SimSettings
 
 _SIM = SimSettings()
@@ -31,6 +32,8 @@ def sim(
     for config in configs:
         if not config.exists():
             raise FileNotFoundError(f"{config} does not exist")
+    if configs:
+        check_output_folder(out)
     from shellgs_method.machine.progress import tell
 
     tell("Importing the simulation")

@@ -56,8 +56,9 @@ class NamedFiles:
     """The files of a scene that one of its files names, whatever the system, machine and folder it was written on.
 
     A path is taken as it is written if a file is there. Else Windows' separators, other cases, compositions and
-    encodings of letters, URLs' escapes and a missing or another suffix are understood, and leading folders that the scene does not
-    have are dropped, until exactly one file fits. Names that are no UTF-8 have surrogates for what is none.
+    encodings of letters, escapes of URLs and a missing or another suffix are understood, and leading folders that the
+    scene does not have are dropped, until exactly one file fits. Names that are no UTF-8 have surrogates for what is
+    none.
     """
 
     def __init__(self, scene: Path, images_path: Path, where: Path):

@@ -128,6 +128,15 @@ def test_a_file_in_place_of_an_output_folder_is_refused_by_its_name(tmp_path, mo
         main()
 
 
+@pytest.mark.parametrize("words", [["elevation", "config.yml", "--output", "NAME"], ["sim", "CONFIG", "NAME"]])
+def test_an_output_folder_that_is_named_like_a_file_is_refused(tmp_path, monkeypatch, words):
+    paths = {"NAME": tmp_path / "front.TIF", "CONFIG": tmp_path / "config.yml"}
+    paths["CONFIG"].touch()
+    monkeypatch.setattr("sys.argv", ["shellgs", *(str(paths.get(word, word)) for word in words)])
+    with pytest.raises(SystemExit, match=r"front\.TIF would be a folder of several files: name it without \.TIF"):
+        main()
+
+
 @pytest.mark.parametrize("words", FOLDERS)
 def test_an_output_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path, monkeypatch, words):
     folder = tmp_path / "archive"
