@@ -569,6 +569,23 @@ def test_the_map_conversion_of_an_ifc_is_applied(
     assert ("has a scale of 1000 and not of 0.001" in caplog.text) == (scale == 1000)
 
 
+def test_the_map_conversion_of_the_3d_context_is_applied_though_that_of_plans_comes_first(tmp_path: Path):
+    file = made.ifc_house(unit=1.0)
+    plans = file.add("IfcGeometricRepresentationContext", None, "Plan", 2, None, file.context.WorldCoordinateSystem)
+    crs = file.add("IfcProjectedCRS", "EPSG:25832")
+    for context, place in ((plans, (0.0, 0.0, 0.0)), (file.context, NATIONAL.tolist())):
+        file.add("IfcMapConversion", context, crs, *place, 1.0, 0.0, None)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
+
+
+def test_a_place_of_the_world_coordinate_system_that_is_not_applied_is_told(tmp_path: Path, caplog):
+    file = made.ifc_house(unit=0.001)
+    at = file.add("IfcCartesianPoint", (NATIONAL * 1000).tolist())
+    file.context.WorldCoordinateSystem = file.add("IfcAxis2Placement3D", at)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), made.ifc_house_faces())
+    assert "its world coordinate system is at 410000 5413000 250 m, which is not applied" in caplog.text
+
+
 def test_a_map_conversion_in_the_units_of_the_model_is_said(tmp_path: Path, caplog):
     """Revit wrote millimetres, and the metre of the map as a foot."""
     file = made.ifc_house(unit=0.001)

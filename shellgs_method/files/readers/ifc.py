@@ -365,17 +365,23 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
 
     if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
         notice(f"{path}: it names no unit of length: its numbers are taken as metres.")
+    _one_map(path, model)
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
+    unit = ifcopenshell.util.unit.calculate_unit_scale(model)
+    origin = ifcopenshell.util.geolocation.get_wcs(model)
     if known is None:
+        if origin is not None and (place := unit * origin[:3, 3]).any():
+            notice(
+                "{}: its world coordinate system is at {:.10g} {:.10g} {:.10g} m, which is not applied without a map "
+                "conversion: its parts keep the coordinates of their placements.".format(path, *place)
+            )
         return points
     known = known._make(map(float, known))  # numbers of property sets may be text
     crs = ifcopenshell.util.geolocation.get_crs(model) or {}
     if crs.get("type") == "IfcGeographicCRS":
         notice(f"{path}: its map, {crs['Name']}, is in degrees: its parts keep the coordinates of the model.")
         return points
-    unit = ifcopenshell.util.unit.calculate_unit_scale(model)
     metres, scale = _scaled(known.scale, unit, _metres_of_map(crs.get("MapUnit"), path), path)
-    origin = ifcopenshell.util.geolocation.get_wcs(model)
     if origin is not None:
         points = transformed(points, np.linalg.inv(origin * np.array([[1, 1, 1, unit]] * 3 + [[1, 1, 1, 1]])))
     place = metres * np.array([known.e, known.n, known.h])
@@ -389,6 +395,17 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     turn = np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]])
     factors = scale * np.array([known.factor_x, known.factor_y, known.factor_z])
     return (points * factors) @ turn.T + place
+
+
+def _one_map(path: Path, model: Any) -> None:
+    """Leave the model the map conversion of its 3D context: ifcopenshell takes the first, even that of plans."""
+    found = [] if model.schema == "IFC2X3" else model.by_type("IfcCoordinateOperation")
+    ours = [each for each in found if getattr(each.SourceCRS, "ContextType", None) == "Model"]
+    if len(ours) > 1:
+        notice(f"{path} has {len(ours)} map conversions of the model: the first is used.")
+    for each in found:
+        if ours and each != ours[0]:
+            model.remove(each)
 
 
 def _scaled(given: float, unit: float, named: float | None, path: Path) -> tuple[float, float]:
