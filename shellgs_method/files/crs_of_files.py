@@ -39,6 +39,8 @@ _WKT = "LASF_Projection", (2112,)
 """User and number of the record of a LAS that holds a WKT."""
 _UNIT, _FEET = 3076, {9002: "0.3048", 9003: "0.30480061"}
 """GeoTIFF key of the unit of eastings, and metres of feet and of US survey feet."""
+_PROJECTED, _CITATION, _OF_USER, _TEXTS = 3072, 3073, 32767, 34737
+"""GeoTIFF keys of the projected system and of its name, the value of one without a code, and the record of names."""
 _HEIGHTS = {9001: 5703, 9002: 8228, 9003: 6360}
 """Some system of heights in each unit, by EPSG: metres, feet, US survey feet."""
 
@@ -157,7 +159,8 @@ def _named_in(contents: bytes | mmap.mmap, pattern: re.Pattern[bytes]) -> str:
 def _of_las(header: LasHeader, path: Path) -> str:
     """A scan's system, which laspy reads without heights; with them where they are in another unit.
 
-    If it has none but is in feet, this is reported. A WKT that laspy does not read is returned as it is.
+    If it has none but is in feet, this is reported. A WKT that laspy does not read is returned as it is, and so is the
+    name of a system that the user defined.
     """
     from pyproj.crs import CRS, CompoundCRS
     from pyproj.exceptions import CRSError
@@ -169,19 +172,32 @@ def _of_las(header: LasHeader, path: Path) -> str:
         return text
     directories: Any = header.vlrs.get("GeoKeyDirectoryVlr")
     keys: dict[int, int] = {key.id: key.value_offset for each in directories for key in each.geo_keys}
+    cited = _citation(header) if keys.get(_PROJECTED) == _OF_USER else ""
+    if cited and (crs is None or crs.is_geographic):  # that of its datum
+        crs = known_crs(cited)
     if crs is None:
         if feet := _FEET.get(keys.get(_UNIT, 0)):
             notice(
                 f"{path} says that it is in feet, and names no system that is known: give it with --crs, or "
                 f"--metres-per-shell-unit {feet}."
             )
-        return ""
+            return ""
+        return cited
     code = _HEIGHTS.get(keys.get(_VERTICAL_UNIT, 0), keys.get(_VERTICAL, 0))
     if len(crs.axis_info) == 2 and code in _EPSG:
         heights = CRS.from_epsg(code)
         if _differ({axis.unit_conversion_factor for axis in (*crs.axis_info, *heights.axis_info)}):
             crs = CompoundCRS(crs.name, [crs, heights])
     return crs.to_wkt()
+
+
+def _citation(header: LasHeader) -> str:
+    """The name of a scan's projected system in its GeoTIFF keys; empty if it has none."""
+    texts = b"".join(each.record_data_bytes() for each in header.vlrs.get_by_id("LASF_Projection", (_TEXTS,)))
+    directories: Any = header.vlrs.get("GeoKeyDirectoryVlr")
+    for key in (key for each in directories for key in each.geo_keys if key.id == _CITATION):
+        return texts[key.value_offset : key.value_offset + key.count].decode("latin-1").strip("|\0 ")
+    return ""
 
 
 def _wkt_of(header: LasHeader) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -206,6 +207,7 @@ def test_a_scan_in_feet_of_an_unknown_system_is_told(tmp_path, caplog):
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.add_crs(pyproj.CRS.from_epsg(2263), keep_compatibility=True)
     directory: Any = header.vlrs.get("GeoKeyDirectoryVlr")[0]
+    directory.geo_keys = [key for key in directory.geo_keys if key.id != 3073]
     for key in directory.geo_keys:
         key.value_offset = 32767 if key.id == 3072 else key.value_offset
     directory.geo_keys.append(GeoKeyEntryStruct(id=3076, count=1, value_offset=9003))
@@ -213,6 +215,22 @@ def test_a_scan_in_feet_of_an_unknown_system_is_told(tmp_path, caplog):
     assert not crs_of(tmp_path / "a.las")
     assert "a.las says that it is in feet, and names no system" in caplog.text
     assert "--metres-per-shell-unit 0.30480061" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("cited", "system"),
+    [("ETRS89 / UTM zone 32N", "EPSG:25832"), ("NAD83 / Texas Central (ftUS)", "EPSG:2277"), ("Site", "")],
+)
+def test_a_scan_of_a_system_without_a_code_is_in_the_one_that_it_names(tmp_path, caplog, cited, system):
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    text = f"a|{cited}|".encode()
+    keys = [(1024, 0, 1, 1), (2048, 0, 1, 4258), (3072, 0, 1, 32767), (3073, 34737, len(cited) + 1, 2)]
+    directory = struct.pack(f"<{4 * len(keys) + 4}H", 1, 1, 0, len(keys), *(value for key in keys for value in key))
+    for number, record in ((34735, directory), (34737, text)):
+        header.vlrs.append(laspy.VLR("LASF_Projection", number, record_data=record))
+    laspy.LasData(header).write(str(tmp_path / "a.las"))
+    assert crs_of(tmp_path / "a.las") == system
+    assert ("that PROJ knows (Site)" in caplog.text) == (not system)
 
 
 FEET = 1200 / 3937
