@@ -521,6 +521,19 @@ def test_negative_indices_of_an_obj_count_back_from_their_face(tmp_path: Path):
     np.testing.assert_array_equal(read.vertices[read.faces][:, :, 2], [[0] * 3, [1] * 3, [2] * 3, [0] * 3])
 
 
+@pytest.mark.parametrize("restarts", [False, True])
+def test_an_obj_whose_objects_count_their_vertices_from_1_is_read_as_one_that_counts_on(tmp_path, caplog, restarts):
+    lines = []
+    for k, corners in enumerate(([(0, 0), (1, 0), (0, 1), (1, 1)], [(5, 0), (6, 0), (5, 1)])):
+        first = 1 if restarts else 1 + 4 * k
+        lines += [f"o {k}", *(f"v {x} {y} {k}" for x, y in corners)]
+        lines += [f"f {first} {first + 1} {first + 2}", *([] if k else ["g b", "f 2 4 3"])]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    mesh = read_geometry(tmp_path / "a.obj")
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [1, 3, 2], [4, 5, 6]])
+    assert ("count vertices from 1 in each of its 2 objects" in caplog.text) == restarts
+
+
 @pytest.mark.parametrize("face", ["0 1 2", "-4 -2 -1", "1 2 9"])
 def test_an_obj_with_indices_of_no_vertex_is_refused(tmp_path: Path, face: str):
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {face}\n")

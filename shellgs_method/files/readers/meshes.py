@@ -53,7 +53,13 @@ def read_obj(path: Path) -> Geometry:
     points = np.loadtxt(map(with_nan, vertices), usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)
-    corners = np.where(stored > 0, stored - 1, stored + np.repeat(np.array(above, np.int64), sizes))
+    ends, of = np.unique(np.array(above, np.int64), return_inverse=True)  # of blocks of vertices, and each face's
+    starts = np.concatenate([[0], ends])
+    end, start = (np.repeat(some[of], sizes) for some in (ends, starts))
+    corners = np.where(stored > 0, stored - 1, stored + end)
+    if len(ends) > 1 and ((stored > 0) & (stored <= end - start)).all():  # the other blocks would be of no face
+        notice(f"{path}: its faces count vertices from 1 in each of its {len(ends)} objects, and are read so.")
+        corners += start
     if (stored == 0).any() or (corners < 0).any():  # counted from 1, or backwards from the last vertex before the face
         raise ValueError("a face has a vertex before the first")
     return Geometry(points, polygon_triangles(points, sizes, corners, path))
