@@ -17,6 +17,8 @@ from shellgs_method.registration.bundle import Bundle, Observations
 
 _RANGE = 0.05
 """Largest change of focal lengths, relative, and of distortion coefficients."""
+_LAST = 2**32 - 1
+"""Largest number of a photograph or camera in a binary model."""
 _SHARED = 10  # photographs of a lens from which on its distortion is found
 
 
@@ -48,9 +50,14 @@ def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle,
     Focal lengths and distortion are free within a range, principal points stay, as in COLMAP.
 
     Raises:
-        SceneError: the model has no tracks, or a lens of a model that cannot be adjusted.
+        SceneError: the model has no tracks, a lens of a model that cannot be adjusted, or numbers of more than 32 bits.
     """
     numbers = {number: k for k, number in enumerate(model.images)}
+    if large := [number for number in (*model.images, *model.cameras) if not 0 <= number <= _LAST]:
+        raise SceneError(
+            f"the model numbers a photograph or camera {large[0]}, which COLMAP's binary models cannot hold: number "
+            "them from 1 to adjust cameras"
+        )
     scale = scale_of(placed)
     rotations = np.stack([image.rotation for image in model.images.values()])
     centres = np.stack([image.centre for image in model.images.values()])

@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import (
     KEYPOINT,
     ColmapCamera,
@@ -194,6 +195,14 @@ def as_model(bundle: Bundle, seen: Observations) -> Model:
     colours = np.zeros((points, 3), np.uint8)
     known = Points(bundle.points, colours, tracks, np.arange(1, points + 1))
     return adjusted_model(Model(cameras, images, known), bundle, np.eye(4))
+
+
+def test_photographs_whose_numbers_a_binary_model_cannot_hold_are_refused_before_the_adjustment():
+    """Scripts number them by time stamps."""
+    model = two_lenses()
+    stamped = {1700000000000 + number: image for number, image in model.images.items()}
+    with pytest.raises(SceneError, match="numbers a photograph or camera 17000000000"):
+        bundle_of(replace(model, images=stamped), np.eye(4))
 
 
 def two_lenses() -> Model:
