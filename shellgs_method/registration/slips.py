@@ -55,6 +55,8 @@ class Slip:
 
 
 _QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_VEHICLE = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""From the axes of a robot or vehicle (REP 103: x ahead, y left, z up) to OpenCV's of a camera that looks ahead."""
 _ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
 OfPoses: TypeAlias = Sequence[tuple[str, Callable[[np.ndarray], np.ndarray]]]
 """Mistakes in poses, and what brings the world to the camera without them."""
@@ -71,6 +73,11 @@ OF_TRANSFORMS: OfPoses = (
         "transform_matrix is from the world to the camera, in OpenCV's axes: invert it, and negate the second and "
         "third columns of that",
         lambda viewmat: np.linalg.inv(OPENGL @ viewmat),
+    ),
+    (
+        "transform_matrix has a vehicle's axes (x ahead, y left, z up) instead of OpenGL's of the camera: replace its "
+        "first three columns by minus the second, the third and minus the first",
+        lambda viewmat: _VEHICLE @ OPENGL @ viewmat,
     ),
     (_ROLLED.format(180), lambda viewmat: np.diag([-1.0, -1.0, 1.0, 1.0]) @ viewmat),
     (_ROLLED.format(90), lambda viewmat: _QUARTER @ viewmat),
@@ -96,6 +103,11 @@ OF_IMAGES: OfPoses = (
         "poses of images.txt have OpenGL's axes of the camera instead of OpenCV's: negate the second and third rows of "
         "their matrices from the world to the camera",
         lambda viewmat: OPENGL @ viewmat,
+    ),
+    (
+        "poses of images.txt have a vehicle's axes (x ahead, y left, z up) instead of the camera's: replace the rows "
+        "of their matrices from the world by minus the second, minus the third and the first",
+        lambda viewmat: _VEHICLE @ viewmat,
     ),
 )
 """Mistakes of a COLMAP model."""

@@ -78,6 +78,7 @@ def test_points_with_other_axes_or_in_another_unit_are_refused_with_the_slip(poi
 
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+AHEAD_LEFT_UP = np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])  # in OpenGL's axes
 
 
 @pytest.mark.parametrize(
@@ -88,8 +89,9 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
         (lambda matrix: np.linalg.inv(matrix @ OPENGL), "in OpenCV's axes: invert it, and negate"),
         (lambda matrix: matrix @ np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "rolled by 90°"),
         (lambda matrix: matrix @ np.diag([-1.0, -1, 1, 1]), "rolled by 180°"),
+        (lambda matrix: matrix @ AHEAD_LEFT_UP, "has a vehicle's axes .* replace its first three columns"),
     ],
-    ids=["OpenCV", "inverse", "OpenCV inverse", "quarter", "half"],
+    ids=["OpenCV", "inverse", "OpenCV inverse", "quarter", "half", "vehicle"],
 )
 def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, words):
     path = scene / "transforms.json"
@@ -109,8 +111,9 @@ def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, wo
         (np.linalg.inv, "are those of the cameras, .* invert them"),
         (lambda viewmat: OPENGL @ viewmat, "have OpenGL's axes of the camera instead of OpenCV's"),
         (lambda viewmat: written_scalar_last(viewmat), "are in the order x y z w"),
+        (lambda viewmat: AHEAD_LEFT_UP.T @ OPENGL @ viewmat, "have a vehicle's axes .* replace the rows"),
     ],
-    ids=["inverse", "OpenGL", "x y z w"],
+    ids=["inverse", "OpenGL", "x y z w", "vehicle"],
 )
 def test_poses_of_another_convention_in_a_colmap_model_are_refused(points, views, change, words, tracks):
     known = tracked(points, views)
