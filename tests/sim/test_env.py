@@ -452,6 +452,7 @@ def test_a_robot_without_bodies_a_free_one_first_or_actuators_is_refused(folder,
         ('<camera name="camera"', "<camera", "no camera named camera"),
         ('<camera name="camera"', '<camera name="camera" projection="orthographic"', "camera is orthographic"),
         ("<worldbody>", '<worldbody><camera name="camera"/>', "camera named camera is fixed to the world"),
+        ("<worldbody>", '<option gravity="0 -9.81 0"/><worldbody>', "gravity is along .* z is up here"),
     ],
 )
 def test_what_a_robot_brings_or_lacks_is_refused(folder, tmp_path, old, new, says):

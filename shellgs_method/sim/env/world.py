@@ -88,6 +88,10 @@ class World:
                 f"{whose}: beside the robot there is a floor or another body, which would stay where it is: give the "
                 "file of the robot alone"
             )
+        if np.any(given.option.gravity[:2]):
+            raise SceneError(
+                f"{whose}: its gravity is along {given.option.gravity}, and z is up here: give one along -z"
+            )
         first.name = first.name or "first"  # as it is found by its name
         spec.option = given.option
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
