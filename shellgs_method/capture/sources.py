@@ -34,11 +34,12 @@ _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neig
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
 # at most, at a tenth of the light, others 0.28 and more.
 _SMALL, _ALIKE = 32, 0.15
+_IN_COLOUR, _FEW_VALUES = {"RGB", "RGBA", "YCbCr", "CMYK"}, 8  # modes of Pillow; values of a map that is no photograph
 _SAME = 0.3  # pixels by which pictures may seem moved that show the same: those encoded again by 0.04, others by 0.9
 
 
 def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]:
-    """The photographs in a folder and its sub-folders, by their names in the scene; reports other files and copies.
+    """The photographs in a folder and its sub-folders, by their names in the scene; reports others, maps and copies.
 
     Args:
         folder: the folder.
@@ -57,7 +58,7 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
             photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
     found: dict[str, Path] = {}
     _tell_what_is_left_out(folder, photographs)
-    for path in _without_copies(folder, photographs):
+    for path in _without_copies(folder, _without_maps(folder, photographs)):
         name = captured_name(path.relative_to(folder))
         if name in found:
             raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
@@ -85,6 +86,37 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
         raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
     if counted:
         notice(f"{others.total()} files of {folder} are not photographs, and are left out ({counted}).")
+
+
+def _without_maps(folder: Path, photographs: Sequence[Path]) -> list[Path]:
+    """Photographs without maps of depth, confidence or labels beside them, which are reported.
+
+    Apps that scan (Polycam, 3D Scanner App, RTAB-Map) export these with the photographs, in grey: depth with 16 bits,
+    the others with few values.
+    """
+    modes = {path: _mode(path) for path in photographs}
+    if not _IN_COLOUR & {*modes.values()}:
+        return [*photographs]
+    maps = [path for path, mode in modes.items() if mode[:1] in ("I", "F") or (mode in ("1", "L") and _has_few(path))]
+    if maps:
+        notice(
+            f"{len(maps)} files of {folder} are maps of depth, confidence or labels, by their values, and are left "
+            f"out: {maps[0].relative_to(folder)}, for example."
+        )
+    return [path for path in photographs if path not in {*maps}]
+
+
+def _mode(photograph: Path) -> str:
+    """Pillow's mode of a photograph; empty if it cannot be read, which is reported when it is used."""
+    with suppress(Exception), Image.open(photograph) as image:
+        return image.mode
+    return ""
+
+
+def _has_few(photograph: Path) -> bool:
+    with suppress(Exception), Image.open(photograph) as image:
+        return image.getcolors(_FEW_VALUES) is not None
+    return False
 
 
 def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:

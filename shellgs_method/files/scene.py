@@ -94,11 +94,11 @@ class SceneLayout(ScenePaths):
             p for folder in sorted(folders) for p in photographs_in(folder, deep=folder == inner) if p not in masks
         ]
         without = {path.relative_to(self.data).as_posix() for path in there if path not in used}
-        for names, why in ((without - recording.bad, "not in"), (recording.bad, "marked as bad in")):
+        for names, why in ((without - recording.bad, "are not in"), (recording.bad, "are marked as bad in")):
             if names:
                 shown = ", ".join(sorted(names)[:3]) + (", …" if len(names) > 3 else "")
                 notice(
-                    f"{len(names)} of {len(there)} photographs of {self.data} are {why} {cameras}, and are left out: "
+                    f"{len(names)} of {len(there)} photographs of {self.data} {why} {cameras}, and are left out: "
                     f"{shown}."
                 )
         names = {frame.name for frame in recording.frames}

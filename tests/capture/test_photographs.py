@@ -104,6 +104,19 @@ def test_copies_of_a_photograph_are_left_out_and_told(tmp_path, caplog):
     assert "IMG_1 copy.jpg is IMG_1.jpg" in caplog.text
 
 
+@pytest.mark.parametrize("in_colour", [True, False])
+def test_maps_of_depth_and_confidence_beside_photographs_in_colour_are_left_out_and_told(tmp_path, caplog, in_colour):
+    """As apps export them; where all is grey, those of 16 bits may be the photographs."""
+    grey = np.arange(24 * 32).reshape(24, 32)
+    photograph().convert("RGB" if in_colour else "L").save(tmp_path / "frame_1.jpg")
+    Image.fromarray(grey.astype(np.uint8)).save(tmp_path / "grey_1.png")
+    Image.fromarray((2000 + grey).astype(np.uint16)).save(tmp_path / "depth_1.png")
+    Image.fromarray((grey % 3).astype(np.uint8)).save(tmp_path / "conf_1.png")
+    found = list(find_photographs(tmp_path))
+    assert found == ["frame_1.jpg", "grey_1.png"] if in_colour else len(found) == 4
+    assert ("2 files of" in caplog.text and "are maps of depth, confidence or labels" in caplog.text) == in_colour
+
+
 @pytest.mark.parametrize("light", [1.0, 0.2])
 def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog, light):
     """As those in nerfstudio's images_2 and images_4; others of the same names are no copies, at night either."""
