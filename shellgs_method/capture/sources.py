@@ -34,6 +34,7 @@ _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neig
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
 # at most, at a tenth of the light, others 0.28 and more.
 _SMALL, _ALIKE = 32, 0.15
+_BLOCK = 4  # pixels of a side, whose means are compared first
 _IN_COLOUR, _FEW_VALUES = {"RGB", "RGBA", "YCbCr", "CMYK"}, 8  # modes of Pillow; values of a map that is no photograph
 _SAME = 0.3  # pixels by which pictures may seem moved that show the same: those encoded again by 0.04, others by 0.9
 
@@ -200,8 +201,22 @@ def show_the_same(before: Float[np.ndarray, "*N H W"], after: Float[np.ndarray, 
 
     Less than its contrast would not do: of a plain wall between bright sky and dark ground, all have the same.
     """
-    moved = min(np.abs(np.diff(after, axis=axis)).mean() for axis in (0, 1))
-    return np.abs(after - before).mean((-2, -1)) < _SAME * moved
+    return np.abs(after - before).mean((-2, -1)) < _most_apart(after)
+
+
+def _most_apart(picture: Float[np.ndarray, "H W"]) -> float:
+    return _SAME * float(min(np.abs(np.diff(picture, axis=axis)).mean() for axis in (0, 1)))
+
+
+def _alike(pictures: Float[np.ndarray, "N H W"]) -> list[list[int]]:
+    """Indices of the pictures before each that show the same; means of their blocks are no further apart than they."""
+    side = _SMALL // _BLOCK
+    blocks = pictures.reshape(-1, side, _BLOCK, side, _BLOCK).mean((2, 4))
+    found = []
+    for k, picture in enumerate(pictures):
+        near = np.flatnonzero(np.abs(blocks[:k] - blocks[k]).mean((1, 2)) < _most_apart(picture))
+        found.append(near[show_the_same(pictures[near], picture)].tolist())
+    return found
 
 
 def _ranks(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
@@ -214,11 +229,8 @@ def tell_of_near_copies(folder: Path, names: Sequence[str]) -> None:
     """Report photographs that show the same as others: encoded again by a messenger, or exposures of a bracket."""
     small = np.stack([_small(folder / name) for name in names])
     ranked = np.stack([_ranks(each) for each in small])
-    copies = [
-        (name, names[int(alike.argmax())])
-        for k, name in enumerate(names)
-        if (alike := show_the_same(small[:k], small[k]) | show_the_same(ranked[:k], ranked[k])).any()
-    ]
+    both = zip(names, _alike(small), _alike(ranked), strict=True)
+    copies = [(name, names[min(of)]) for name, *found in both if (of := found[0] + found[1])]
     if copies:
         notice(
             f"{len(copies)} of {len(names)} photographs show the same as others ({copies[0][0]} as {copies[0][1]}, "
