@@ -175,14 +175,6 @@ def test_geo_tags_bound_the_scale_and_the_shift(tmp_path, views, surface, survey
     np.testing.assert_allclose(shift, survey_from_scene[:2, 3], atol=3.0)
 
 
-def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
-    twins = twins_of(mesh, 40)
-    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, unplaced("s.ply", crs="EPSG:25832"))
-    assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
-    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m away from it\.", placement.history[1])
-    assert not any("Ambiguous" in sentence for sentence in placement.history)
-
-
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.001])
 def test_geo_tags_are_told_of_if_a_shell_is_as_far_as_in_a_system(
     tmp_path, mesh, views, points, monkeypatch, metres_per_unit
