@@ -200,9 +200,8 @@ class Blocks:
             raise SceneError(f"{path} is not there: run `shellgs blocks {shlex.quote(str(path.parent))}` first")
         contents = read_json(path)
         try:
-            tree = _node(_item(contents, "tree", "it"), "tree")
-            cameras = BoundCameras.from_json(contents.get("cameras", {}))
-            blocks = cls(tree, _number(_item(contents, "overlap", "it"), "overlap"), cameras)
+            tree, overlap = _node(contents.get("tree"), "tree"), _number(contents.get("overlap"), "overlap")
+            blocks = cls(tree, overlap, BoundCameras.from_json(contents.get("cameras", {})))
         except (TypeError, ValueError, RecursionError) as error:
             why = "its tree is too deep" if isinstance(error, RecursionError) else error
             raise SceneError(f"{path} is damaged: {why}; correct it, or remove it and cut again") from error
@@ -236,38 +235,24 @@ def _written(node: Fork | Block) -> dict[str, Any]:
 
 def _node(record: object, where: str) -> Fork | Block:
     """The part of the tree that ``where`` names in messages, as ``tree.below.above``."""
-    if isinstance(record, dict) and "cut" in record:
-        cut = _cut(record["cut"], f"{where}.cut")
-        below, above = (_node(_item(record, side, where), f"{where}.{side}") for side in ("below", "above"))
-        return Fork(cut, below, above)
-    name = _item(record, "name", where)
-    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 100 or name == "None":
-        raise ValueError(f"{where}.name is {_shown(name)}, which cannot name a block")
-    photographs = _item(record, "photographs", name)
-    if not isinstance(photographs, list) or not all(isinstance(path, str) for path in photographs):
-        raise ValueError(f"the photographs of {name} are {_shown(photographs)}, no list of paths")
-    return Block(name, tuple(photographs))
-
-
-def _cut(record: object, where: str) -> Cut:
-    normal, offset = _item(record, "normal", where), _number(_item(record, "offset", where), f"{where}.offset")
-    if not isinstance(normal, list) or len(normal) != 3:
-        raise ValueError(f"{where}.normal is {_shown(normal)}, no list of three numbers")
-    x, y, z = (_number(value, f"{where}.normal") for value in normal)
-    length = float(np.linalg.norm((x, y, z)))
-    if length == 0:
-        raise ValueError(f"{where}.normal is 0")
-    if abs(length - 1) < 1e-12:  # as we write it: what is read and written again has the same fingerprint
-        length = 1.0
-    return Cut((x / length, y / length, z / length), offset / length)
-
-
-def _item(record: object, key: str, where: str) -> object:
-    if not isinstance(record, dict):
-        raise ValueError(f"{where} is {_shown(record)}, no object with {key!r}")
-    if key not in record:
-        raise ValueError(f"{where} lacks {key!r}")
-    return record[key]
+    match record:
+        case {"cut": {"normal": [_, _, _] as normal, "offset": offset}, "below": below, "above": above}:
+            x, y, z = (_number(value, f"{where}.cut.normal") for value in normal)
+            length = float(np.linalg.norm((x, y, z)))
+            if length == 0:
+                raise ValueError(f"{where}.cut.normal is 0")
+            if abs(length - 1) < 1e-12:  # as we write it: what is read and written again has the same fingerprint
+                length = 1.0
+            cut = Cut((x / length, y / length, z / length), _number(offset, f"{where}.cut.offset") / length)
+            return Fork(cut, _node(below, f"{where}.below"), _node(above, f"{where}.above"))
+        case {"name": str(name), "photographs": [*paths]} if all(isinstance(path, str) for path in paths):
+            if not _NAME.fullmatch(name) or len(name) > 100 or name == "None":
+                raise ValueError(f"{where}.name is {_shown(name)}, which cannot name a block")
+            return Block(name, tuple(paths))
+    raise ValueError(
+        f"{where} is {_shown(record)}, neither a cut, of a normal of three numbers and an offset, with what is below "
+        "and above, nor a name with a list of photographs"
+    )
 
 
 def _number(value: object, where: str) -> float:

@@ -56,39 +56,29 @@ def test_a_file_whose_photographs_are_those_of_other_cuts_is_refused(tmp_path: P
     Blocks.read(path)
 
 
+def _cut(cut: str, above: str = '{"name": "a", "photographs": []}') -> str:
+    return f'{{"overlap": 1, "tree": {{"cut": {cut}, "below": {{"name": "a", "photographs": []}}, "above": {above}}}}}'
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("[]", "damaged"),
-        ('{"overlap": 1}', "lacks 'tree'"),
-        ('{"overlap": "1", "tree": {"name": "a", "photographs": []}}', 'overlap is "1", no number'),
+        ('{"overlap": 1}', "tree is null, neither"),
+        ('{"tree": {"name": "a", "photographs": []}}', "overlap is null, no number"),
         ('{"overlap": NaN, "tree": {"name": "a", "photographs": []}}', "overlap is NaN, no number"),
         ('{"overlap": -1, "tree": {"name": "a", "photographs": []}}', "negative"),
         ('{"overlap": 1, "tree": {"name": "../a", "photographs": []}}', "cannot name a block"),
-        ('{"overlap": 1, "tree": {"name": "a", "photographs": "b"}}', "no list of paths"),
-        ('{"overlap": 1, "tree": null}', "tree is null, no object with 'name'"),
-        ('{"overlap": 1, "tree": {"name": "a"}}', "a lacks 'photographs'"),
-        ('{"overlap": 1, "tree": {"cut": null}}', "tree.cut is null, no object with 'normal'"),
-        ('{"overlap": 1, "tree": {"cut": [1, 0, 0]}}', r"tree.cut is \[1, 0, 0\], no object with 'normal'"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0]}}}', "tree.cut lacks 'offset'"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": 1, "offset": 1}}}', "tree.cut.normal is 1, no list of three"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0], "offset": 1}}}', "no list of three numbers"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, []], "offset": 1}}}', r"tree.cut.normal is \[\], no number"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1' + "0" * 400 + "}}}", "offset is 1000"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [0, 0, 0], "offset": 1}}}', "tree.cut.normal is 0"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}}}', "tree lacks 'below'"),
+        ('{"overlap": 1, "tree": {"name": "a", "photographs": "b"}}', "nor a name with a list of photographs"),
+        ('{"overlap": 1, "tree": {"name": "a", "photographs": [1]}}', "nor a name with a list of photographs"),
+        (_cut('{"normal": [1, 0], "offset": 1}'), "neither a cut, of a normal of three numbers"),
+        (_cut('{"normal": [1, 0, []], "offset": 1}'), r"tree.cut.normal is \[\], no number"),
+        (_cut('{"normal": [1, 0, 0], "offset": 1' + "0" * 400 + "}"), "tree.cut.offset is 1000"),
+        (_cut('{"normal": [0, 0, 0], "offset": 1}'), "tree.cut.normal is 0"),
+        (_cut('{"normal": [1, 0, 0], "offset": 1}', above="[]"), r"tree.above is \[\], neither"),
+        (_cut('{"normal": [1, 0, 0], "offset": 1}'), "two blocks named a"),
         ('{"overlap": 1, "tree": {"name": "a", "photographs": []}, "cameras": []}', "damaged: its cameras are list"),
         ('{"overlap": 1, "tree": {"name": "a", "photographs": []}, "cameras": {"1.png": [2]}}', "camera of 1.png is"),
-        (
-            '{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}, '
-            '"below": {"name": "a", "photographs": []}, "above": []}}',
-            r"tree.above is \[\], no object with 'name'",
-        ),
-        (
-            '{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}, '
-            '"below": {"name": "a", "photographs": []}, "above": {"name": "a", "photographs": []}}}',
-            "two blocks named a",
-        ),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(tmp_path: Path, text: str, said: str):
