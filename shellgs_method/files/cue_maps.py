@@ -160,12 +160,17 @@ class CueMaps:
     @property
     def names(self) -> list[str]:
         """Names of the images that have a map, sorted."""
-        return sorted(self._files)
+        return sorted(path.relative_to(self.folder).as_posix()[: -len(".npz")] for path in self.folder.rglob("*.npz"))
 
     def record(self, name: str) -> MapRecord | None:
         """Record of a view's map, read without decoding the map; None when the view has none."""
-        path = self._path_of(name)
-        return None if path is None else self._attempt(read_record, path, name)
+        path = self._path(name)
+        if not path.is_file():
+            return None
+        record = self._attempt(read_record, path, name)
+        if record.image != name:
+            raise self._refusal(name, f"it is that of {record.image!r}")
+        return record
 
     def read(self, name: str, camera: Camera, *, any_size: bool = False) -> CueMap | None:
         """Read the map of a view; None when it has none.
@@ -181,7 +186,7 @@ class CueMaps:
         own = self.check(name, camera, any_size=any_size)
         if own is None:
             return None
-        cue = self._attempt(lambda path: read_arrays(path, own), self._path(name), name)
+        cue = self._attempt(read_arrays, self._path(name), name)
         if problem := damage(cue, own):
             raise self._refusal(name, problem)
         return cue if (own.width, own.height) == (camera.width, camera.height) else resampled(cue, camera)
@@ -203,10 +208,9 @@ class CueMaps:
         Raises:
             SceneError: as :meth:`read`, as far as the map's record shows.
         """
-        path = self._path_of(name)
-        if path is None:
+        record = self.record(name)
+        if record is None:
             return None
-        record = self._attempt(read_record, path, name)
         own = record.camera
         if not any_size and (own.width, own.height) != (camera.width, camera.height):
             sizes = f"it is {own.width}x{own.height} pixels, the camera {camera.width}x{camera.height}"
@@ -232,45 +236,17 @@ class CueMaps:
         """Store the map of a view; the file appears whole or not at all."""
         if problem := damage(cue, camera):
             raise SceneError(f"the {self.kind} map of view {name!r} cannot be stored: {problem}")
-        path = self._path(name)
-        write_map(path, cue, MapRecord.of(name, cue, camera, self.manifest.sources))
-        claims = self._files.setdefault(name, [path])
-        if path not in claims:
-            claims.append(path)
+        write_map(self._path(name), cue, MapRecord.of(name, cue, camera, self.manifest.sources))
 
     def remove(self, name: str) -> None:
         """Delete the map of a view, which would be refused as one of an earlier set."""
-        for path in self._files.pop(name, []):
-            path.unlink(missing_ok=True)
+        self._path(name).unlink(missing_ok=True)
 
     def _path(self, name: str) -> Path:
         parts = PurePosixPath(name)
         if not parts.parts or parts.is_absolute() or ".." in parts.parts:
             raise SceneError(f"view {name!r} is not named by a path inside the scene")
         return self.scene / map_path(self.kind, name)
-
-    def _path_of(self, name: str) -> Path | None:
-        path = self._path(name)
-        claims = self._files.get(name, [])
-        strays = [str(claim) for claim in claims if claim != path]
-        if strays:
-            raise SceneError(
-                f"view {name!r} has two {self.kind} maps: {', '.join(strays)} claims to be its map, which belongs "
-                f"at {path}; delete the wrong one, then run `{self.command}`"
-            )
-        return path if claims else None
-
-    @cached_property
-    def _files(self) -> dict[str, list[Path]]:
-        """Map files by the view that their record names; an unreadable one by the view of its file name."""
-        files: dict[str, list[Path]] = {}
-        for path in sorted(self.folder.rglob("*.npz")):
-            try:
-                name = read_record(path).image
-            except UNREADABLE:
-                name = path.relative_to(self.folder).as_posix().removesuffix(".npz")
-            files.setdefault(name, []).append(path)
-        return files
 
     @cached_property
     def _stale(self) -> str | None:
