@@ -74,7 +74,7 @@ _ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_ply_header(path: Path) -> PlyHeader:
-    """Read the header of a PLY file, and check that the file is as long as it claims.
+    """Read the header of a PLY file, and check that a binary one is as long as it claims.
 
     Raises:
         ValueError: it is cut off, or its header is damaged.
@@ -106,24 +106,10 @@ def read_ply_header(path: Path) -> PlyHeader:
         raise ValueError("its header has a negative count")
     if order is None:
         length += len(BOM_UTF8) * start.startswith(BOM_UTF8, length)
-        _check_lines(path, length, elements)
-    elif (claimed := length + sum(_least_bytes(element) for element in elements)) > path.stat().st_size:
-        raise ValueError(f"its header claims at least {claimed} bytes, but it has {path.stat().st_size}")
+    least = [e.count * sum(int((prop.counted or prop.type)[1:]) for prop in e.properties) for e in elements]
+    if order and length + sum(least) > path.stat().st_size:
+        raise ValueError(f"its header claims at least {length + sum(least)} bytes, but it has {path.stat().st_size}")
     return PlyHeader(order, length, elements)
-
-
-def _least_bytes(element: PlyElement) -> int:
-    return element.count * sum(int((prop.counted or prop.type)[1:]) for prop in element.properties)
-
-
-def _check_lines(path: Path, length: int, elements: list[PlyElement]) -> None:
-    with path.open(encoding="latin-1") as file:  # lines may end as on old Macs
-        file.seek(length)
-        there = sum(1 for line in file if line.strip())
-    for element in elements:
-        if element.count > there:
-            raise ValueError(f"it holds {there} of the {element.count} lines of its element {element.name!r}")
-        there -= element.count
 
 
 _LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of a record of a LAS file besides its points

@@ -166,7 +166,10 @@ def test_a_broken_transforms_json_is_refused_in_a_sentence(scene, shellgs, fault
 AXES = b"property float x\nproperty float y\nproperty float z\n"
 CUT_PLY = b"ply\nformat ascii 1.0\nelement vertex 9\n" + AXES + b"end_header\n0 0 0\n"
 BAD_CLOUDS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "cut": (lambda scene: (scene / "sparse_pc.ply").write_bytes(CUT_PLY), "it holds 1 of the 9 lines"),
+    "cut": (
+        lambda scene: (scene / "sparse_pc.ply").write_bytes(CUT_PLY),
+        "it holds fewer numbers than its header claims",
+    ),
     "no ply": (lambda scene: (scene / "sparse_pc.ply").write_bytes(b"points"), "does not begin with the header"),
     "gone": (lambda scene: (scene / "sparse_pc.ply").unlink(), "sparse_pc.ply, the SfM points"),
     "outside": (lambda scene: change(scene, None, ply_file_path="/dev/zero"), "'/dev/zero', which is not inside"),
@@ -478,9 +481,7 @@ def test_an_ascii_ply_that_is_cut_in_its_faces_is_refused(scene, shellgs, kept):
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     cut = faces[: int(kept * len(faces))]
     (scene / "shell" / "facade.ply").write_text("\n".join([*header, *lines, *cut]) + "\n")
-    assert f"it holds {len(cut)} of the {len(faces)} lines of its element 'face'" in refused(
-        shellgs, scene, "align", scene
-    )
+    assert "it holds fewer numbers than its header claims" in refused(shellgs, scene, "align", scene)
 
 
 def test_one_vertex_absurdly_far_away_costs_only_its_own_triangles(scene, caplog):
