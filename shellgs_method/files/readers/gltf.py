@@ -113,6 +113,7 @@ class _Document:
         self.json = json.loads(data)
         if not str(self.json["asset"]["version"]).startswith("2"):
             raise SceneError(f"the shell {path} is glTF {self.json['asset']['version']}: export it as glTF 2.0")
+        self.used = {*self.json.get("extensionsUsed", []), *self.json.get("extensionsRequired", [])}
         self._buffers: dict[int, bytes] = {}
 
     def listed(self, name: str) -> list[dict[str, Any]]:
@@ -123,21 +124,24 @@ class _Document:
 
     def check_extensions(self) -> None:
         """Refuse, by their names, extensions without which the geometry is another."""
-        used, required = (set(self.json.get(key, [])) for key in ("extensionsUsed", "extensionsRequired"))
-        if any(name.startswith(_SPLATS) for name in used | required):
+        if any(name.startswith(_SPLATS) for name in self.used):
             raise splats(self.path)
-        for name in sorted(required):
+        for name in sorted(self.json.get("extensionsRequired", [])):
             if name in _COMPRESSED:
-                raise self._compressed(name)
+                raise self._without(name)
             if not name.startswith(_READ):
                 raise SceneError(f"the shell {self.path} needs {name}, which is not read: export it without")
-        if _MOVED in used:
+        if _MOVED in self.used:
             raise SceneError(f"the shell {self.path} is moved by {_MOVED}, which is not read: export it without")
 
-    def _compressed(self, name: str) -> SceneError:
-        return SceneError(
-            f"the shell {self.path} is compressed with {name}, which is not read: export it without compression"
-        )
+    def _without(self, what: str) -> Exception:
+        """The refusal of what lacks a part: as compressed, by the name of the extension, if the file has any."""
+        for name in _COMPRESSED:
+            if name in self.used:
+                return SceneError(
+                    f"the shell {self.path} is compressed with {name}, which is not read: export it without compression"
+                )
+        return ValueError(f"its {what}")
 
     # Nodes
 
@@ -190,7 +194,7 @@ class _Document:
             mode = primitive.get("mode", _TRIANGLES)
             if mode not in modes:
                 continue
-            points = self._accessor_of(primitive, primitive["attributes"]["POSITION"])
+            points = self.accessor(primitive["attributes"]["POSITION"])
             for weight, target in zip(weights, primitive.get("targets", []), strict=False):
                 if weight and "POSITION" in target:
                     points = points + weight * self.accessor(target["POSITION"])
@@ -203,7 +207,7 @@ class _Document:
     def _triangles(self, primitive: dict[str, Any], mode: int, count: int) -> Int64[np.ndarray, "F 3"]:
         indices, restart = np.arange(count), -1
         if "indices" in primitive:
-            stored = self._accessor_of(primitive, primitive["indices"])[:, 0]
+            stored = self.accessor(primitive["indices"])[:, 0]
             restart = {"u1": 0xFF, "u2": 0xFFFF, "u4": 0xFFFFFFFF}[stored.dtype.str[1:]]
             indices = stored.astype(np.int64)
         if mode == _TRIANGLES:
@@ -213,13 +217,6 @@ class _Document:
         if len(faces) and faces.max() >= count:  # in one mesh, it would be a vertex of another primitive
             raise SceneError(f"{self.path}: the shell's triangles have vertex indices outside its {count} vertices")
         return faces
-
-    def _accessor_of(self, primitive: dict[str, Any], index: int) -> Shaped[np.ndarray, "N C"]:
-        for name in _COMPRESSED:
-            fields = self.listed("accessors")[index]
-            if name in primitive.get("extensions", {}) and not fields.keys() & {"bufferView", "sparse"}:
-                raise self._compressed(name)
-        return self.accessor(index)
 
     # Buffers
 
@@ -232,7 +229,7 @@ class _Document:
         elif "sparse" in fields and count <= _MOST:
             values = np.zeros((count, width), kind)
         else:
-            raise ValueError(f"its accessor {index} has no values")
+            raise self._without(f"accessor {index} has no values")
         if sparse := fields.get("sparse"):
             values = values.copy()
             stored = sparse["indices"]
@@ -244,10 +241,6 @@ class _Document:
 
     def _values(self, fields: dict[str, Any], kind: np.dtype, count: int, width: int) -> Shaped[np.ndarray, "N C"]:
         view = self.listed("bufferViews")[fields["bufferView"]]
-        buffer = self.listed("buffers")[view["buffer"]]
-        for name in _COMPRESSED:
-            if name in view.get("extensions", {}) and "uri" not in buffer and not self._is_chunk(view["buffer"]):
-                raise self._compressed(name)
         start, length = view.get("byteOffset", 0), view["byteLength"]
         data = memoryview(self._buffer(view["buffer"]))[start : start + length]
         if len(data) < length or start < 0:
@@ -255,9 +248,6 @@ class _Document:
         stride = view.get("byteStride") or width * kind.itemsize
         at = fields.get("byteOffset", 0)
         return np.ndarray((count, width), kind, data, at, (stride, kind.itemsize))  # refuses what lies beyond the data
-
-    def _is_chunk(self, index: int) -> bool:
-        return index == 0 and self.chunk is not None
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
@@ -268,7 +258,7 @@ class _Document:
         uri = self.listed("buffers")[index].get("uri")
         if uri is None:
             if self.chunk is None or index:
-                raise ValueError(f"its buffer {index} is missing")
+                raise self._without(f"buffer {index} is missing")
             return self.chunk
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2])
