@@ -10,13 +10,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, fingerprint, read_json, remove_leftovers, write_whole
@@ -72,7 +72,7 @@ class Manifest:
     max_image_size: int | None = None
     licence: str | None = None
     error: float | None = None
-    shellgs: str = field(default_factory=lambda: _version())
+    shellgs: str = field(default_factory=lambda: metadata.version("shellgs"))
     format: int = FORMAT
 
     def __post_init__(self) -> None:
@@ -273,17 +273,11 @@ class CueMaps:
     @cached_property
     def _aligned_to(self) -> BoundCameras:
         """Cameras that the shell's alignment, a source of the maps, was found for; none where that is unknown."""
-        for fields in self._alignments:
-            with suppress(KeyError, TypeError, ValueError):  # reported when the alignment is used
-                return BoundCameras.from_json(fields["cameras"])
+        for source in self.manifest.sources:
+            with suppress(OSError, KeyError, TypeError, ValueError):  # no alignment, or reported when it is used
+                if source.endswith(".json"):
+                    return BoundCameras.from_json(read_json(self.scene / source)["cameras"])
         return BoundCameras()
-
-    @property
-    def _alignments(self) -> Iterator[dict[str, Any]]:
-        """Json files among the sources, of which alignments are some."""
-        for path in (self.scene / source for source in self.manifest.sources if source.endswith(".json")):
-            with suppress(OSError, SceneError):
-                yield read_json(path)
 
     @property
     def command(self) -> str:
@@ -340,10 +334,3 @@ def relative_path(path: Path, scene: Path) -> str:
         if inner.is_relative_to(folder) and ".." not in (relative := inner.relative_to(folder)).parts:
             return relative.as_posix()
     return str(path.resolve())
-
-
-def _version() -> str:
-    try:
-        return metadata.version("shellgs")
-    except metadata.PackageNotFoundError:
-        return "unknown"
