@@ -109,8 +109,7 @@ def merged(
 class Cloud:
     """A point cloud in a file, whose points are read again at each iteration over them.
 
-    Points at exactly 0 0 0, which scanners write where a ray hit nothing, are left out with a warning that counts them;
-    one that is among the others is taken for a point of the surface.
+    Points at exactly 0 0 0, which scanners write where a ray hit nothing, are left out with a warning that counts them.
 
     Args:
         path: the file.
@@ -140,7 +139,6 @@ class Cloud:
         if self.path.is_file() and self.path.stat().st_size > _LARGE:
             tell(f"Reading {self.path.name}")
         total, missed = 0, 0
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
         try:
             for piece in read(self.path) or ():
                 total += len(piece.positions)
@@ -148,17 +146,12 @@ class Cloud:
                 if misses.any() and (misses := misses & ~piece.positions.any(axis=1)).any():
                     missed += int(misses.sum())
                     piece = _chosen(piece, ~misses)
-                low = np.fmin(low, np.fmin.reduce(piece.positions, axis=0, initial=np.inf))
-                high = np.fmax(high, np.fmax.reduce(piece.positions, axis=0, initial=-np.inf))
                 yield piece
         except SceneError:
             raise
         except Exception as error:  # each format's reader raises errors of its own for a damaged file
             raise damaged(self.path, error) from error
-        if missed == 1 and (low <= 0).all() and (high >= 0).all():
-            yield Points(np.zeros((1, 3)))
-        else:
-            left_out(self.path, missed, total, "points at exactly 0 0 0, which are misses of the scanner")
+        left_out(self.path, missed, total, "points at exactly 0 0 0, which are misses of the scanner")
 
 
 def damaged(path: Path, error: Exception) -> SceneError:

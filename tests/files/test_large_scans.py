@@ -57,16 +57,6 @@ def test_normals_of_a_file_are_averaged_and_scanners_collected():
     np.testing.assert_array_equal(cloud.scanners, [ORIGIN, ORIGIN + 1])
 
 
-def test_the_one_point_at_the_origin_has_no_normal_of_its_own(tmp_path: Path):
-    """It is kept, as one among others, and handed over without what the reader said of it."""
-    points = np.random.default_rng(0).uniform(-1, 1, (100, 3))
-    points[50] = 0
-    cloud = Cloud(tmp_path, lambda _: iter([Points(points, np.tile([0.0, 0, -1], (100, 1)))])).whole
-    assert cloud.normals is not None
-    assert len(cloud.points) == 100
-    assert {*map(tuple, cloud.normals.tolist())} == {(0, 0, -1), (0, 0, 0)}
-
-
 def test_a_cloud_is_read_anew_each_time(tmp_path: Path):
     reads: list[Path] = []
 

@@ -1002,12 +1002,6 @@ def test_misses_at_the_origin_are_left_out_and_counted(tmp_path: Path, caplog, s
     assert "left out 50 of 350 points at exactly 0 0 0, which are misses of the scanner" in caplog.text
 
 
-@pytest.mark.parametrize(("origin", "kept"), [(np.zeros(3), 301), (NATIONAL, 300)])
-def test_one_point_at_the_origin_is_kept_among_others(tmp_path: Path, origin: np.ndarray, kept: int):
-    np.savetxt(tmp_path / "a.xyz", np.concatenate([POINTS + origin, np.zeros((1, 3))]))
-    assert len(read_geometry(tmp_path / "a.xyz").vertices) == kept
-
-
 @pytest.mark.parametrize("order", ["<", ">", None])
 @pytest.mark.parametrize("piece", [7, 1 << 20])
 def test_points_of_a_ply_come_in_pieces_with_their_normals(tmp_path: Path, monkeypatch, order: str | None, piece: int):
