@@ -44,24 +44,6 @@ COLOURED: dict[str, Callable[[Path], Iterator[Points]]] = {
     **dict.fromkeys((".las", ".laz"), partial(read_las, coloured=True)),
     ".e57": partial(read_e57, coloured=True),
 }
-_ADVICE = {
-    "unpack it, and give the files in it": (".zip", ".7z", ".rar", ".gz", ".tar", ".kmz", ".slpk"),
-    "export it as E57, LAZ or PLY, with the scanner's program": (
-        *(".rcp", ".rcs", ".fls", ".lsproj", ".zfs", ".rdb", ".rdbx", ".rxp", ".lgs", ".lgsx", ".dp", ".cl3", ".pod"),
-        *(".ptg", ".imp"),
-    ),
-    "export it as IFC, or as a mesh (OBJ, GLB, STL)": (
-        *(".dwg", ".dxf", ".dgn", ".rvt", ".rfa", ".pln", ".skp", ".3dm", ".nwd", ".nwc", ".step", ".stp", ".iges"),
-        *(".igs", ".ifcxml", ".max", ".blend", ".c4d"),
-    ),
-    "export it as a mesh (OBJ, GLB, STL), in its own scale": (
-        *(".fbx", ".dae", ".3ds", ".usd", ".usda", ".usdc", ".usdz", ".3mf", ".wrl", ".x3d", ".vtk", ".osgb", ".abc"),
-    ),
-    "export the building as CityGML, or as a mesh in a system of its region: tiles are in the frame of the Earth": (
-        *(".b3dm", ".i3dm", ".cmpt", ".pnts", ".subtree"),
-    ),
-}
-"""What to do with files of other formats."""
 SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
 
@@ -92,10 +74,9 @@ def read_surface(path: Path) -> Geometry | Cloud:
         return Cloud(path, CLOUDS[suffix], COLOURED.get(suffix))
     read = MESHES.get(suffix)
     if read is None:
-        usual = f"export it as one of {', '.join([*MESHES, *CLOUDS])}"
-        advice = next((advice for advice, kinds in _ADVICE.items() if suffix in kinds), usual)
         raise SceneError(
-            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: {advice}"
+            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: export it, in "
+            f"the coordinates of its region, as one of {', '.join([*MESHES, *CLOUDS])}"
         )
     try:
         if suffix == ".ply" and holds_splats(path):

@@ -203,8 +203,6 @@ def test_a_roof_is_read_where_what_is_not_seen_has_its_outline(tmp_path: Path, i
     ("change", "words"),
     [
         (lambda d: d.update(type="FeatureCollection"), "is json, but not CityJSON"),
-        (lambda d: d.update(type=None, geometricError=500), "is a tileset of 3D Tiles, in the frame of the Earth"),
-        (lambda d: d.update(type="FeatureCollection", features=[]), "is a GeoJSON, which has no walls"),
         (lambda d: d.update(version="0.9"), "is CityJSON 0.9: upgrade it"),
         (lambda d: d["vertices"].pop(), "vertex indices outside its"),
         (lambda d: d["transform"].update(scale=[1e-8, 1e-8, 1e-3], translate=[139.7, 35.6, 0]), "in degrees"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -226,21 +225,10 @@ def test_a_missing_shell_is_refused_with_its_file_name(tmp_path: Path):
         load_shell(tmp_path / "nowhere.ply")
 
 
-@pytest.mark.parametrize(
-    ("name", "advice"),
-    [
-        ("shell.bak", r"export it as one of \.ply, \.obj"),
-        ("shell.DXF", "export it as IFC, or as a mesh"),
-        ("shell.fbx", "export it as a mesh .* in its own scale"),
-        ("shell.rcp", "export it as E57, LAZ or PLY"),
-        ("shell.zip", "unpack it"),
-        ("shell.b3dm", "tiles are in the frame of the Earth"),
-    ],
-)
-def test_a_file_of_an_unknown_format_is_refused(tmp_path: Path, name: str, advice: str):
-    (tmp_path / name).write_bytes(b"0")
-    with pytest.raises(SceneError, match=f"{re.escape(name)} .*: {advice}"):
-        load_shell(tmp_path / name)
+def test_a_file_of_an_unknown_format_is_refused(tmp_path: Path):
+    (tmp_path / "shell.DXF").write_bytes(b"0")
+    with pytest.raises(SceneError, match=r"shell\.DXF .*: export it, .* as one of \.ply, \.obj"):
+        load_shell(tmp_path / "shell.DXF")
 
 
 def test_triangles_with_nan_are_dropped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -21,22 +21,6 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 _LINES = ("MultiPoint", "MultiLineString")
 
 
-_OTHERS = {
-    "geometricError": "a tileset of 3D Tiles, in the frame of the Earth: export the building as CityGML, or as a mesh "
-    "in a system of its region",
-    "dataType": "the header of an EPT, whose points are in files beside it: join them in a LAZ (`pdal translate`)",
-    "hierarchy": "the header of a cloud for Potree: give the LAS or LAZ that it was made of",
-    "features": "a GeoJSON, which has no walls: export it as CityJSON, CityGML, IFC or a mesh",
-}
-"""What other json is, by a name in it."""
-
-
-def _other_json(document: Any) -> str:
-    names = document if isinstance(document, dict) else {}
-    usual = "json, but not CityJSON: export it as CityJSON, CityGML, IFC or a mesh"
-    return next((words for name, words in _OTHERS.items() if name in names), usual)
-
-
 def read_cityjson(path: Path) -> Geometry:
     """Read what is seen from outside of the objects of a CityJSON, or of all lines of a CityJSONSeq, in its units.
 
@@ -47,7 +31,7 @@ def read_cityjson(path: Path) -> Geometry:
     documents = _documents(path.read_text("utf-8-sig"))
     head = documents[0]
     if not isinstance(head, dict) or head.get("type") != "CityJSON":
-        raise SceneError(f"the shell {path} is {_other_json(head)}")
+        raise SceneError(f"the shell {path} is json, but not CityJSON: export it as CityJSON, CityGML, IFC or a mesh")
     missing: Counter[str] = Counter()
     objects: list[CityObject] = []
     for document in documents:
