@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8, UInt16
 from pi_heif import open_heif
-from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 from PIL.TiffImagePlugin import TiffImageFile
 
 from shellgs_method.errors import SceneError, notice
@@ -34,8 +34,6 @@ _SCALED = 0.1
 """Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
 _ROUNDED = 2.0
 """Pixels of a side, of the smaller of photograph and camera, that rounding both to whole ones explains."""
-_OTHERS = (".exr", ".hdr", ".jxl", ".jxr")
-"""Suffixes of formats that Pillow does not read."""
 _TURN_BACK = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -388,19 +386,10 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
             "photographs down, or put the whole file back if it is damaged"
         ) from error
     except Exception as error:  # each decoder raises its own errors for a damaged file
-        if isinstance(error, UnidentifiedImageError) and path.suffix.lower() in (".tif", ".tiff"):
-            raise SceneError(
-                f"{path} is a TIFF of a kind that is not read, such as floating-point numbers, or truncated: save it "
-                "in RGB of 8 or 16 bits, or put the whole file back"
-            ) from error
         reason = " ".join(str(error).split())
-        if path.suffix.lower() in _OTHERS:
-            raise SceneError(
-                f"{path} is in a format that is not read as a photograph: save it as JPEG, or as PNG or TIFF of 8 or "
-                "16 bits"
-            ) from error
         raise SceneError(
-            f"{path} cannot be read as an image ({reason}): put the whole file back, or leave it out"
+            f"{path} cannot be read as an image ({reason}): put the whole file back, or save it as JPEG, or as PNG or "
+            "TIFF in RGB of 8 or 16 bits, or leave it out"
         ) from error
     with image:
         if largest != first:
