@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -20,15 +19,6 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL = ("normal_x", "normal_y", "normal_z")
 _IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]
 _MOST_EXPANDED = 100  # LZF expands a byte to at most 88
-
-
-@dataclass(frozen=True)
-class _Column:
-    """A coordinate: its type, the bytes before it in a point, and the number of numbers before it."""
-
-    kind: np.dtype
-    start: int
-    number: int
 
 
 def read_pcd(path: Path) -> Iterator[Points]:
@@ -48,17 +38,18 @@ def _points(file: IO[bytes], fields: dict[str, list[str]], path: Path) -> Iterat
     counts = [int(count) for count in fields.get("COUNT", ["1"] * len(names))]
     if not len(names) == len(kinds) == len(counts) or min(counts) < 1:
         raise ValueError(f"its header has {len(names)} fields, {len(kinds)} types and {len(counts)} counts")
-    sizes = [np.dtype(kind).itemsize * count for kind, count in zip(kinds, counts, strict=True)]
+    point = np.dtype(
+        [(f"{k}", f"<{kind}", (count,)) for k, (kind, count) in enumerate(zip(kinds, counts, strict=True))]
+    )
     if missing := [name for name in "xyz" if name not in names]:
         raise ValueError(f"it has no field {missing[0]}")
     has_normals = all(name in names for name in _NORMAL)
-    where = [names.index(name) for name in ("x", "y", "z", *(_NORMAL if has_normals else ()))]
-    columns = [_Column(np.dtype("<" + kinds[k]), sum(sizes[:k]), sum(counts[:k])) for k in where]
+    columns = [names.index(name) for name in ("x", "y", "z", *(_NORMAL if has_normals else ()))]
     points = int(fields["POINTS"][0]) if "POINTS" in fields else int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
     if [float(value) for value in fields.get("VIEWPOINT", _IDENTITY)] != _IDENTITY:
         notice(f"{path}: its VIEWPOINT is not applied: the points are taken as those of one frame.")
     read = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}[fields["DATA"][0].lower()]
-    for table in read(file, columns, points, sizes):
+    for table in read(file, columns, points, point):
         yield Points(table[:, :3], table[:, 3:] if has_normals else None)
 
 
@@ -77,8 +68,8 @@ def _header(file: IO[bytes]) -> dict[str, list[str]]:
 _Tables = Iterator[Float64[np.ndarray, "N C"]]
 
 
-def _text(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
-    read, used = 0, [column.number for column in columns]
+def _text(file: IO[bytes], columns: list[int], points: int, point: np.dtype) -> _Tables:
+    read, used = 0, [sum(point[before].shape[0] for before in range(column)) for column in columns]
     lines = (with_nan(line.decode("latin-1")) for line in file if line.strip())
     while some := list(islice(lines, PIECE)):
         table = np.loadtxt(some, usecols=used, ndmin=2, comments="#")
@@ -88,25 +79,24 @@ def _text(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]
         raise ValueError(f"it holds {read} of {points} points")
 
 
-def _binary(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
-    each = sum(sizes)
-    there = (Path(file.name).stat().st_size - file.tell()) // each
+def _binary(file: IO[bytes], columns: list[int], points: int, point: np.dtype) -> _Tables:
+    there = (Path(file.name).stat().st_size - file.tell()) // point.itemsize
     if not 0 <= points <= there:
         raise ValueError(f"it holds {there} of {points} points")
     for start in range(0, points, PIECE):
-        count = min(PIECE, points - start)
-        data = file.read(count * each)
-        yield _stacked([np.ndarray((count,), column.kind, data, column.start, (each,)) for column in columns])
+        table = np.frombuffer(file.read(min(PIECE, points - start) * point.itemsize), point)
+        yield _stacked([table[f"{column}"][:, 0] for column in columns])
 
 
-def _compressed(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
+def _compressed(file: IO[bytes], columns: list[int], points: int, point: np.dtype) -> _Tables:
     """All values of a field together, then those of the next."""
     data = file.read()
     packed, size = struct.unpack_from("<II", data)
-    if size != points * sum(sizes) or packed > len(data) - 8 or size > _MOST_EXPANDED * packed:
-        raise ValueError(f"it holds {packed} bytes for {points} points of {sum(sizes)} bytes")
+    if size != points * point.itemsize or packed > len(data) - 8 or size > _MOST_EXPANDED * packed:
+        raise ValueError(f"it holds {packed} bytes for {points} points of {point.itemsize} bytes")
     values = _expanded(data[8 : 8 + packed], size)
-    yield _stacked([np.frombuffer(values, column.kind, points, column.start * points) for column in columns])
+    starts = [points * sum(point[before].itemsize for before in range(column)) for column in columns]
+    yield _stacked([np.frombuffer(values, point[k].base, points, at) for k, at in zip(columns, starts, strict=True)])
 
 
 def _stacked(columns: list[np.ndarray]) -> Float64[np.ndarray, "N C"]:
