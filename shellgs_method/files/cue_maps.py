@@ -20,7 +20,6 @@ from typing import TypeVar
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, fingerprint, read_json, remove_leftovers, write_whole
-from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.map_files import (
     FORMAT,
     UNREADABLE,
@@ -35,7 +34,6 @@ from shellgs_method.files.map_files import (
     resampled,
     write_map,
 )
-from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.camera import Camera
 
 T = TypeVar("T")
@@ -215,11 +213,6 @@ class CueMaps:
         if not any_size and (own.width, own.height) != (camera.width, camera.height):
             sizes = f"it is {own.width}x{own.height} pixels, the camera {camera.width}x{camera.height}"
             raise self._refusal(name, sizes, max(camera.width, camera.height))
-        if problem := self._aligned_to.camera_changed(name, camera):
-            raise SceneError(
-                f"the {self.kind} maps of {self.scene} are of a shell that was aligned to other cameras: {problem}; "
-                f"run `shellgs align {shlex.quote(str(self.scene))}` to validate it with these, then `{self.command}`"
-            )
         fitted = own.resized(camera.width, camera.height)
         if problem := self._stale or difference(record, fitted, camera, self.manifest.sources):
             raise self._refusal(name, problem)
@@ -250,34 +243,14 @@ class CueMaps:
 
     @cached_property
     def _stale(self) -> str | None:
-        """The first source that has changed since the maps were made, in words; missing sources are ignored.
-
-        A shell that is no longer the one that was aligned must be validated before it can be cast.
-        """
+        """The first source that has changed since the maps were made, in words; missing sources are ignored."""
         for source, sha256 in self.manifest.sources.items():
             path = self.scene / source
             # Outside the scene only a file (a shell) is opened: a manifest may name anything.
             known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
             if known and sha256 != source_hash(path):
-                first = f"run `shellgs align {shlex.quote(str(self.scene))}` first, to validate it as it is now"
-                return f"{source} has changed since" + (f": {first}" if sha256 in self._validated else "")
+                return f"{source} has changed since"
         return None
-
-    @property
-    def _validated(self) -> str:
-        """Hashes of the shell's files that were aligned, as they are written; a truth is not validated."""
-        with suppress(OSError, SceneError):
-            return str(read_json(self.scene / ALIGNMENT).get("hashes"))
-        return ""
-
-    @cached_property
-    def _aligned_to(self) -> BoundCameras:
-        """Cameras that the shell's alignment, a source of the maps, was found for; none where that is unknown."""
-        for source in self.manifest.sources:
-            with suppress(OSError, KeyError, TypeError, ValueError):  # no alignment, or reported when it is used
-                if source.endswith(".json"):
-                    return BoundCameras.from_json(read_json(self.scene / source)["cameras"])
-        return BoundCameras()
 
     @property
     def command(self) -> str:
