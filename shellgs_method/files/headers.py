@@ -133,12 +133,7 @@ def check_las(path: Path) -> None:
     length, start, records, kind, each, points = struct.unpack_from("<HIIBHI", header, 94)
     extended_start = extended = 0
     if minor >= 4 and len(header) == 375:
-        counted = points
         extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
-        if counted > points:
-            raise ValueError(
-                f"its header counts {counted} points as before LAS 1.4, and {points} as LAS 1.4 does: write it again"
-            )
     scales = struct.unpack_from("<3d", header, 131)
     if not all(0 < abs(scale) < 1e9 for scale in scales):
         raise ValueError(f"its header scales the coordinates by {' '.join(f'{scale:g}' for scale in scales)}")
