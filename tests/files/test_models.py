@@ -229,15 +229,6 @@ def test_the_line_where_json_is_damaged_is_said(tmp_path: Path, text: str, words
         read_geometry(save(tmp_path / "a.json", text))
 
 
-@pytest.mark.parametrize("swapped", [False, True])
-def test_swapped_axes_are_told_by_roofs_that_face_down(tmp_path: Path, caplog, swapped: bool):
-    axes = [1, 0, 2] if swapped else [0, 1, 2]
-    faces = [Face([ring[:, axes] for ring in face.rings], face.surface) for face in house()]
-    ground = Face([faces[-1].rings[0][::-1]], "GroundSurface")  # as seen from below
-    read_geometry(made.save_json(tmp_path / "a.json", made.cityjson([*faces[:-1], ground])))
-    assert ("northing before easting" in caplog.text) == swapped
-
-
 def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog, capsys):
     file = made.ifc_house(unit=1.0)
     file.project.UnitsInContext = None
@@ -414,7 +405,7 @@ def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplo
     assert "1 Room" in caplog.text
 
 
-def test_terrain_is_ground_and_faces_up(tmp_path: Path, caplog):
+def test_terrain_is_ground(tmp_path: Path):
     corners = np.array([[0, 0, 0], [40, 0, 1], [40, 30, 2], [0, 30, 0.5]]) + NATIONAL
     faces = [Face([corners[[0, 1, 2]]], "GroundSurface"), Face([corners[[0, 2, 3]]], "GroundSurface")]
     patches = "".join(made.polygon_gml(face.rings).replace("gml:Polygon", "gml:Triangle") for face in faces)
@@ -422,7 +413,6 @@ def test_terrain_is_ground_and_faces_up(tmp_path: Path, caplog):
     relief = f"<dem:TINRelief><dem:lod>2</dem:lod><dem:tin>{tin}</dem:tin></dem:TINRelief>"
     relief = f"<dem:reliefComponent>{relief}</dem:reliefComponent>"
     assert_cast_as(save(tmp_path / "a.gml", made.citygml(relief, kind="dem:ReliefFeature")), faces)
-    assert "face down" not in caplog.text
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])

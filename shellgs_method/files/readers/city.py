@@ -22,7 +22,6 @@ from shellgs_method.files.readers.contents import (
 )
 from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import SurfaceClass
-from shellgs_method.geometry.triangles import area_vectors
 
 _CLASSES = {
     "WallSurface": SurfaceClass.WALL,
@@ -31,8 +30,6 @@ _CLASSES = {
     **dict.fromkeys(("Window", "WindowSurface"), SurfaceClass.WINDOW),
     **dict.fromkeys(("Door", "DoorSurface"), SurfaceClass.DOOR),
 }
-_UPWARDS = {"RoofSurface": 1, "GroundSurface": -1}
-"""Which surfaces of a building face up, and which down. Terrain is ground, but faces up."""
 _OPENINGS = ("Window", "WindowSurface", "Door", "DoorSurface")
 _INSIDE = ("InteriorWallSurface", "CeilingSurface", "FloorSurface")
 _NOTHING = "ClosureSurface"
@@ -163,25 +160,9 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     left_out(path, int((sizes[~holes] < 3).sum()), int((~holes).sum()), "polygons, which have fewer than 3 corners")
     say_missed(path, len(cut.missed), int((~holes).sum()))
     classes = np.array(found.classes, np.uint8)[cut.polygon]
-    up = np.array([_UPWARDS.get(polygon.surface, 0) for polygon in found.polygons])[cut.polygon]
-    _tell_if_mirrored(up * area_vectors(vertices, cut.faces)[:, 2], path)
     return Geometry(vertices, cut.faces, classes=classes, drawn=True)
 
 
 def ring_of(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
     """A ring's corners without those that repeat the one before, as the last repeats the first."""
     return points[(points != np.roll(points, 1, axis=0)).any(axis=1)] if len(points) > 1 else points
-
-
-def _tell_if_mirrored(known: Float64[np.ndarray, " F"], path: Path) -> None:
-    """Warn of roofs that face down: polygons wind inwards, or the axes are swapped, which no rotation undoes.
-
-    Args:
-        known: areas of triangles that are known to face up or down, seen from there, negative from the other side.
-        path: the file.
-    """
-    if known.sum() < -0.5 * np.abs(known).sum():
-        notice(
-            f"{path}: its roofs face down, so that its polygons are wound inwards, which does not matter, or its "
-            "coordinates are northing before easting, which mirrors the building: if it does not align, swap them."
-        )
