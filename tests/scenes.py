@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -29,6 +33,14 @@ def parse(scene: Path, split: str = "train", **config) -> DataparserOutputs:
 def views_of(scene: Path, **config) -> list[View]:
     """The photographs of a scene, with their cameras."""
     return read_views(FacadeDataParserConfig(data=scene, **config))
+
+
+@contextmanager
+def edited(path: Path) -> Iterator[dict[str, Any]]:
+    """What a json file holds, which is written as it is left."""
+    contents = json.loads(path.read_text())
+    yield contents
+    path.write_text(json.dumps(contents))
 
 
 def write_colmap(scene: Path, views: list[View], ids: list[int], model: str = "PINHOLE", extra: str = "") -> None:

@@ -17,7 +17,7 @@ import laspy
 import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
-from scenes import parse, photograph, scan, views_of, write_colmap, write_video
+from scenes import edited, parse, photograph, scan, views_of, write_colmap, write_video
 
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method import cli
@@ -52,19 +52,15 @@ def refused(shellgs: Command, scene: Path, *words: object) -> str:
 
 def change(scene: Path, frame: int | None, **values: object) -> None:
     """Set entries of transforms.json, or of one of its frames."""
-    path = scene / "transforms.json"
-    transforms = json.loads(path.read_text())
-    (transforms if frame is None else transforms["frames"][frame]).update(values)
-    path.write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        (transforms if frame is None else transforms["frames"][frame]).update(values)
 
 
 def pose(scene: Path, frame: int, change: Callable[[np.ndarray], object]) -> None:
-    path = scene / "transforms.json"
-    transforms = json.loads(path.read_text())
-    matrix = np.array(transforms["frames"][frame]["transform_matrix"])
-    change(matrix)
-    transforms["frames"][frame]["transform_matrix"] = matrix.tolist()
-    path.write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        matrix = np.array(transforms["frames"][frame]["transform_matrix"])
+        change(matrix)
+        transforms["frames"][frame]["transform_matrix"] = matrix.tolist()
 
 
 def remove(scene: Path, *keys: str) -> None:
@@ -408,6 +404,7 @@ def test_a_tiff_is_read_in_its_colours_or_refused_as_what_it_is(tmp_path):
     [
         (lambda path: with_header(path, 64_000, 48_000), r"frame_00002.png has more than .* megapixels"),
         (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\xff" * 99), "frame_00002.png cannot be read"),
+        (lambda path: path.write_bytes(path.read_bytes()[:200]), "frame_00002.png cannot be read"),
         (lambda path: path.write_bytes(b""), "frame_00002.png cannot be read"),
         (float_tiff, "frame_00002.png holds floating-point numbers and NaN or infinite ones"),
     ],

@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import PHONE, parse, views_of, write_colmap
+from scenes import PHONE, edited, parse, views_of, write_colmap
 
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig
@@ -117,10 +117,9 @@ def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, meth
         write_colmap(scene, views_of(scene), list(range(1, 11)))
         config = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all", **common)
     else:
-        transforms = json.loads((scene / "transforms.json").read_text())
-        if kind == "ns-process-data":
-            transforms["applied_transform"] = [[0.0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3]]
-        (scene / "transforms.json").write_text(json.dumps(transforms))
+        with edited(scene / "transforms.json") as transforms:
+            if kind == "ns-process-data":
+                transforms["applied_transform"] = [[0.0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3]]
         config = NerfstudioDataParserConfig(eval_mode="all", **common)
     theirs = config.setup().get_dataparser_outputs("train")
     order = {path: k for k, path in enumerate(theirs.image_filenames)}
@@ -174,10 +173,9 @@ def test_a_camera_far_from_all_others_does_not_shrink_the_scene(scene, away, cap
 
 
 def test_photographs_of_one_pose_are_told(scene, caplog):
-    meta = json.loads((scene / "transforms.json").read_text())
-    for frame in meta["frames"][4:6]:
-        frame["transform_matrix"] = meta["frames"][3]["transform_matrix"]
-    (scene / "transforms.json").write_text(json.dumps(meta))
+    with edited(scene / "transforms.json") as meta:
+        for frame in meta["frames"][4:6]:
+            frame["transform_matrix"] = meta["frames"][3]["transform_matrix"]
     views_of(scene)
     told = (
         "3 photographs with exactly the pose of another, images/frame_00004.png and images/frame_00005.png for example"
@@ -282,11 +280,9 @@ def test_black_points_are_grey_and_told(scene, caplog, kind):
 
 @pytest.mark.parametrize("given", ["k1", "distortion_params"])
 def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given):
-    path = scene / "transforms.json"
-    meta = json.loads(path.read_text())
-    meta |= {"k1": 0.0, "k2": 0.01} if given == "k1" else {given: [0.0, 0.01, 0, 0, 0, 0]}
-    meta["frames"][1] |= {"fl_x": 1.5 * meta["fl_x"], "k1": -0.1}
-    path.write_text(json.dumps(meta))
+    with edited(scene / "transforms.json") as meta:
+        meta |= {"k1": 0.0, "k2": 0.01} if given == "k1" else {given: [0.0, 0.01, 0, 0, 0, 0]}
+        meta["frames"][1] |= {"fl_x": 1.5 * meta["fl_x"], "k1": -0.1}
     first, second = views_of(scene)[:2]
     assert first.lens is not None
     assert second.lens is not None
@@ -316,15 +312,14 @@ def test_null_in_a_camera_says_nothing(scene):
 )
 def test_photographs_of_nearly_their_cameras_size_or_shape_are_told_of(scene, caplog, size, told):
     """As the undistorted ones of COLMAP, as they are or scaled down, beside the cameras of the originals."""
-    path = scene / "transforms.json"
-    meta = json.loads(path.read_text())
-    frames = meta["frames"]
-    for frame in frames[:2]:
-        with Image.open(scene / frame["file_path"]) as image:
-            image.resize((4000, 3000)).save(scene / frame["file_path"])
-        frame |= {"w": size[0], "h": size[1], "cx": size[0] / 2, "cy": size[1] / 2, "fl_x": size[0], "fl_y": size[0]}
-    meta["frames"] = frames[:2]
-    path.write_text(json.dumps(meta))
+    width, height = size
+    with edited(scene / "transforms.json") as meta:
+        frames = meta["frames"]
+        for frame in frames[:2]:
+            with Image.open(scene / frame["file_path"]) as image:
+                image.resize((4000, 3000)).save(scene / frame["file_path"])
+            frame |= {"w": width, "h": height, "cx": width / 2, "cy": height / 2, "fl_x": width, "fl_y": width}
+        meta["frames"] = frames[:2]
     views_of(scene)
     assert ("2 photographs of" in caplog.text and "not quite: images/frame_00001.png is" in caplog.text) == told
 
@@ -639,11 +634,10 @@ def store_turned(scene: Path, orientation: int, which: slice = slice(None)) -> d
 
 def turn_cameras(scene: Path) -> None:
     """Make the cameras those of photographs that are stored turned by half a turn."""
-    transforms = json.loads((scene / "transforms.json").read_text())
-    transforms |= {"cx": transforms["w"] - transforms["cx"], "cy": transforms["h"] - transforms["cy"]}
-    for frame in transforms["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, -1, 1, 1])).tolist()
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        transforms |= {"cx": transforms["w"] - transforms["cx"], "cy": transforms["h"] - transforms["cy"]}
+        for frame in transforms["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, -1, 1, 1])).tolist()
 
 
 def with_heights_as_colours(scene: Path) -> None:
@@ -664,9 +658,8 @@ def without_colours(scene: Path) -> None:
 
 
 def without_points(scene: Path) -> None:
-    transforms = json.loads((scene / "transforms.json").read_text())
-    del transforms["ply_file_path"]
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        del transforms["ply_file_path"]
 
 
 def differences(scene: Path, upright: dict[str, np.ndarray]) -> list[float]:
@@ -696,11 +689,10 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_n
     upright = store_turned(scene, 3, slice(0, 10, 2))
     without_colours(scene)
     if not applied:
-        transforms = json.loads((scene / "transforms.json").read_text())
-        turn_cameras(scene)
-        turned = json.loads((scene / "transforms.json").read_text())
-        transforms["frames"][::2] = turned["frames"][::2]
-        (scene / "transforms.json").write_text(json.dumps(transforms))
+        with edited(scene / "transforms.json") as transforms:
+            turn_cameras(scene)
+            turned = json.loads((scene / "transforms.json").read_text())
+            transforms["frames"][::2] = turned["frames"][::2]
     expected = {stem: pixels if applied else np.rot90(pixels, 2) for stem, pixels in upright.items()}
     assert max(differences(scene, expected)) < 4
     assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
@@ -713,12 +705,13 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_the_sha
     upright = store_turned(scene, 3, slice(0, 10, 2))
     store_turned(scene, 6, slice(1, 10, 2))
     without_colours(scene)
-    transforms = json.loads((scene / "transforms.json").read_text())
-    swapped = {one: transforms[other] for one, other in ("wh", "hw", ("fl_x", "fl_y"), ("fl_y", "fl_x"), ("cx", "cy"))}
-    for k, frame in enumerate(transforms["frames"][1::2]):
-        if not sides[k % len(sides)]:
-            frame |= swapped | {"cy": transforms["w"] - transforms["cx"]}
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        swapped = {
+            one: transforms[other] for one, other in ("wh", "hw", ("fl_x", "fl_y"), ("fl_y", "fl_x"), ("cx", "cy"))
+        }
+        for k, frame in enumerate(transforms["frames"][1::2]):
+            if not sides[k % len(sides)]:
+                frame |= swapped | {"cy": transforms["w"] - transforms["cx"]}
     applied = sides == [True]
     expected = {stem: pixels if applied else np.rot90(pixels, 2) for stem, pixels in upright.items()}
     assert max(differences(scene, expected)) < 4
@@ -738,9 +731,8 @@ def test_a_square_photograph_is_turned_for_an_upright_camera(scene):
     for path in (scene / "images").iterdir():
         with Image.open(path) as image:
             image.crop((8, 0, 40, 32)).save(path)
-    transforms = json.loads((scene / "transforms.json").read_text())
-    transforms |= {"w": 32, "cx": transforms["cx"] - 8}
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        transforms |= {"w": 32, "cx": transforms["cx"] - 8}
     assert max(differences(scene, store_turned(scene, 6))) < 4
 
 
@@ -765,20 +757,6 @@ def test_a_photograph_of_another_shape_is_refused_by_name(scene):
     Image.new("RGB", (30, 30)).save(view.image)
     with pytest.raises(SceneError, match=r"frame_00002.png is 30x30 pixels, but its camera is 48x32"):
         load_photograph(view)
-
-
-def test_a_truncated_photograph_is_refused_by_name(scene):
-    view = parse(scene).metadata["views"][0]
-    view.image.write_bytes(view.image.read_bytes()[:200])
-    with pytest.raises(SceneError, match=r"frame_00002.png cannot be read"):
-        load_photograph(view)
-
-
-def test_missing_images_are_refused_by_name(scene):
-    for number in (3, 4, 5):
-        (scene / "images" / f"frame_0000{number}.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"3 of \d+ images .*frame_00003.png"):
-        parse(scene)
 
 
 def test_a_list_of_photographs_that_is_not_text_is_refused_by_name(scene):
@@ -910,9 +888,8 @@ def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
     views = views_of(scene)
     assert "left out" not in caplog.text
     if kind == "transforms.json":
-        transforms = json.loads((scene / "transforms.json").read_text())
-        transforms["frames"] = transforms["frames"][:7]
-        (scene / "transforms.json").write_text(json.dumps(transforms))
+        with edited(scene / "transforms.json") as transforms:
+            transforms["frames"] = transforms["frames"][:7]
     else:
         write_colmap(scene, views[:7], list(range(1, 8)))
     (scene / "images" / "more").mkdir()
@@ -924,20 +901,18 @@ def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
 
 
 def test_photographs_in_no_list_of_the_splits_are_counted(scene, caplog):
-    transforms = json.loads((scene / "transforms.json").read_text())
-    frames = [frame["file_path"] for frame in transforms["frames"]]
-    transforms |= {"train_filenames": frames[:6], "test_filenames": frames[6:8]}
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        frames = [frame["file_path"] for frame in transforms["frames"]]
+        transforms |= {"train_filenames": frames[:6], "test_filenames": frames[6:8]}
     assert len(names(parse(scene))) == 6
     assert "2 of 10 photographs of" in caplog.text
     assert "in no list of its splits" in caplog.text
 
 
 def test_photographs_in_the_lists_of_training_and_of_a_held_out_split_are_counted(scene, caplog):
-    transforms = json.loads((scene / "transforms.json").read_text())
-    frames = [frame["file_path"] for frame in transforms["frames"]]
-    transforms |= {"train_filenames": frames, "val_filenames": frames[:1], "test_filenames": frames[:2]}
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        frames = [frame["file_path"] for frame in transforms["frames"]]
+        transforms |= {"train_filenames": frames, "val_filenames": frames[:1], "test_filenames": frames[:2]}
     assert len(names(parse(scene))) == 10
     assert "2 of 2 held-out photographs of" in caplog.text
     assert "remove them from train_filenames" in caplog.text
@@ -954,11 +929,10 @@ def test_a_held_out_photograph_whose_copy_is_trained_on_is_told(scene, caplog, c
 
 @pytest.mark.parametrize("empty", ["val", "test"])
 def test_an_empty_list_is_that_of_a_split_that_is_not_used(scene, empty):
-    transforms = json.loads((scene / "transforms.json").read_text())
-    frames = [frame["file_path"] for frame in transforms["frames"]]
-    lists = {"train": frames[2:], "val": frames[:2], "test": frames[:2]} | {empty: []}
-    transforms |= {f"{split}_filenames": listed for split, listed in lists.items()}
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        frames = [frame["file_path"] for frame in transforms["frames"]]
+        lists = {"train": frames[2:], "val": frames[:2], "test": frames[:2]} | {empty: []}
+        transforms |= {f"{split}_filenames": listed for split, listed in lists.items()}
     assert [len(names(parse(scene, split=split))) for split in ("train", "val", "test")] == [8, 2, 2]
 
 
@@ -966,10 +940,9 @@ def test_an_empty_list_is_that_of_a_split_that_is_not_used(scene, empty):
 
 
 def respell(scene: Path, spell: Callable[[str], str]) -> None:
-    transforms = json.loads((scene / "transforms.json").read_text())
-    for frame in transforms["frames"]:
-        frame["file_path"] = spell(frame["file_path"])
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        for frame in transforms["frames"]:
+            frame["file_path"] = spell(frame["file_path"])
 
 
 SPELLINGS: dict[str, Callable[[str], str]] = {
@@ -1049,12 +1022,11 @@ def test_a_deleted_photograph_is_not_taken_from_another_folder(scene, caplog):
 
 def test_masks_and_points_are_found_however_their_paths_are_written(scene):
     Image.new("L", (48, 32), 255).save(scene / "mask.png")
-    transforms = json.loads((scene / "transforms.json").read_text())
-    transforms["ply_file_path"] = "D:\\shoot\\sparse_pc.ply"
-    for frame in transforms["frames"]:
-        frame["mask_path"] = ".\\MASK.PNG"
     before = parse(scene).metadata["points3D_xyz"]
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        transforms["ply_file_path"] = "D:\\shoot\\sparse_pc.ply"
+        for frame in transforms["frames"]:
+            frame["mask_path"] = ".\\MASK.PNG"
     torch.testing.assert_close(parse(scene).metadata["points3D_xyz"], before)
     assert views_of(scene)[0].mask == scene / "mask.png"
 
@@ -1084,13 +1056,12 @@ def test_the_file_of_the_cameras_is_no_scene(scene):
 
 
 def test_a_users_mask_is_attached_at_the_cameras_size(scene):
-    transforms = json.loads((scene / "transforms.json").read_text())
-    mask = np.zeros((64, 96), np.uint8)
-    mask[:, 48:] = 255
-    Image.fromarray(mask).save(scene / "mask.png")
-    for frame in transforms["frames"]:
-        frame["mask_path"] = "mask.png"
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        mask = np.zeros((64, 96), np.uint8)
+        mask[:, 48:] = 255
+        Image.fromarray(mask).save(scene / "mask.png")
+        for frame in transforms["frames"]:
+            frame["mask_path"] = "mask.png"
     batch = FacadeDataset(parse(scene))[0]
     assert batch["mask"].shape == (32, 48, 1)
     assert not batch["mask"][:, :24].any()

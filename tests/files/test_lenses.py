@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import views_of, write_colmap
+from scenes import edited, views_of, write_colmap
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View, load_photograph
@@ -24,13 +23,12 @@ WIDTH, HEIGHT = 480, 320
 
 def with_lens(scene: Path, model: str, coefficients: dict[str, float]) -> list[View]:
     """Views of the scene, as if larger photographs had been taken with another lens."""
-    transforms = json.loads((scene / "transforms.json").read_text())
-    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 400.0, "fl_y": 396.0, "cx": 235.0, "cy": 163.0, "camera_model": model}
-    transforms |= lens | coefficients
-    for frame in transforms["frames"]:
-        for key in (*lens, "k1", "k2", "p1", "p2"):
-            frame.pop(key, None)
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 400.0, "fl_y": 396.0, "cx": 235.0, "cy": 163.0, "camera_model": model}
+        transforms |= lens | coefficients
+        for frame in transforms["frames"]:
+            for key in (*lens, "k1", "k2", "p1", "p2"):
+                frame.pop(key, None)
     return views_of(scene)
 
 

@@ -18,7 +18,7 @@ import trimesh
 from alignments import TRUTH, displaced, shifted
 from cameras import pinhole
 from PIL import Image
-from scenes import views_of, write_colmap
+from scenes import edited, views_of, write_colmap
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.commands import cast as casting
@@ -209,12 +209,11 @@ def test_another_alignment_makes_the_maps_stale(scene, shellgs):
 
 def move_cameras(scene: Path, motion: np.ndarray, digits: int = 17) -> None:
     """Apply a similarity to the scene's frame, as another run of structure from motion does."""
-    transforms = json.loads((scene / "transforms.json").read_text())
-    for frame in transforms["frames"]:
-        pose = motion @ np.array(frame["transform_matrix"])
-        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
-        frame["transform_matrix"] = [[float(f"{x:.{digits}g}") for x in row] for row in pose.tolist()]
-    (scene / "transforms.json").write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        for frame in transforms["frames"]:
+            pose = motion @ np.array(frame["transform_matrix"])
+            pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+            frame["transform_matrix"] = [[float(f"{x:.{digits}g}") for x in row] for row in pose.tolist()]
     cloud = trimesh.load(scene / "sparse_pc.ply")
     cloud.apply_transform(motion).export(scene / "sparse_pc.ply")
 
@@ -272,9 +271,8 @@ def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shel
 
 
 def test_an_alignment_of_an_older_version_knows_no_hashes_and_is_used(scene):
-    fields = json.loads((scene / ALIGNMENT).read_text())
-    del fields["hashes"]
-    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    with edited(scene / ALIGNMENT) as fields:
+        del fields["hashes"]
     (scene / "shell/facade.ply").touch()
     assert run_of(scene).shell is not None
 
@@ -370,9 +368,8 @@ def test_a_camera_that_changed_is_named(views, change, words):
 
 
 def test_an_alignment_of_an_older_version_is_cast_and_says_so(scene, shellgs):
-    fields = json.loads((scene / ALIGNMENT).read_text())
-    del fields["cameras"]
-    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    with edited(scene / ALIGNMENT) as fields:
+        del fields["cameras"]
     scene = scene.rename(scene.with_name("my scene"))
     told = shellgs("cast", scene, "--no-check")
     assert f"does not say which cameras it was found for: `shellgs align '{scene}'` records them" in told

@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from scenes import views_of
+from scenes import edited, views_of
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -94,11 +94,9 @@ AHEAD_LEFT_UP = np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0
     ids=["OpenCV", "inverse", "OpenCV inverse", "quarter", "half", "vehicle"],
 )
 def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, words):
-    path = scene / "transforms.json"
-    transforms = json.loads(path.read_text())
-    for frame in transforms["frames"]:
-        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
-    path.write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        for frame in transforms["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
     layout = FacadeDataParserConfig(data=scene)
     with pytest.raises(SceneError, match=f"the cameras do not see the SfM points .*: .*{words}"):
         check_points(find_sparse_points(layout), read_views(layout))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scenes import parse, views_of, write_colmap
+from scenes import edited, parse, views_of, write_colmap
 from training_runs import data_of, model_of, trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig
@@ -25,13 +25,11 @@ MILLIMETRE = 1e-3
 
 def moved_to_national_coordinates(scene: Path) -> None:
     """Shift all coordinates of the scene, and the alignment of its shell."""
-    path = scene / "transforms.json"
-    transforms = json.loads(path.read_text())
-    for frame in transforms["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] += NATIONAL
-        frame["transform_matrix"] = pose.tolist()
-    path.write_text(json.dumps(transforms))
+    with edited(scene / "transforms.json") as transforms:
+        for frame in transforms["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] += NATIONAL
+            frame["transform_matrix"] = pose.tolist()
     cloud = trimesh.load(scene / "sparse_pc.ply")
     assert isinstance(cloud, trimesh.PointCloud)
     rows = np.concatenate([cloud.vertices + NATIONAL, cloud.colors[:, :3]], axis=1)

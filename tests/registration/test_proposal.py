@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 import trimesh
 from alignments import AXES, TRUTH, degrees_of, displaced, error
 from PIL import ExifTags, Image
-from scenes import views_of
+from scenes import edited, views_of
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
@@ -216,9 +215,8 @@ def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
     path = tmp_path / "alignment.json"
     alignment.save(path)
     assert Alignment.load(path) == alignment
-    older = json.loads(path.read_text())
-    del older["up"]
-    path.write_text(json.dumps(older))
+    with edited(path) as older:
+        del older["up"]
     up = Alignment.load(path).up
     assert up is not None
     np.testing.assert_array_equal(up, alignment.up)
