@@ -6,6 +6,7 @@ import json
 import shutil
 import unicodedata
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +43,16 @@ def test_every_eighth_image_by_sorted_name_is_held_out_starting_with_the_first(p
 
 
 def test_held_out_photographs_that_are_all_of_one_camera_of_a_rig_are_told(scene, caplog):
-    meta = json.loads((scene / "transforms.json").read_text())
     frames = []
-    for k, frame in enumerate(meta["frames"][:5]):
-        for yaw in range(4):
-            turn = np.eye(4)
-            turn[:3, :3] = cv2.Rodrigues(np.array([0, yaw * np.pi / 2, 0]))[0]
-            name = f"images/{k}_camera{yaw}.png"
-            shutil.copy(scene / frame["file_path"], scene / name)
-            frames.append({"file_path": name, "transform_matrix": (frame["transform_matrix"] @ turn).tolist()})
-    (scene / "transforms.json").write_text(json.dumps(meta | {"frames": frames}))
+    with edited(scene / "transforms.json") as meta:
+        for k, frame in enumerate(meta["frames"][:5]):
+            for yaw in range(4):
+                turn = np.eye(4)
+                turn[:3, :3] = cv2.Rodrigues(np.array([0, yaw * np.pi / 2, 0]))[0]
+                name = f"images/{k}_camera{yaw}.png"
+                shutil.copy(scene / frame["file_path"], scene / name)
+                frames.append({"file_path": name, "transform_matrix": (frame["transform_matrix"] @ turn).tolist()})
+        meta["frames"] = frames
     parse(scene, "test", eval_interval=5)
     assert "look to one side" not in caplog.text
     parse(scene, "test", eval_interval=4)
@@ -152,12 +153,11 @@ def test_cameras_are_moved_to_the_rescaled_world_as_points_are(scene, method):
 def test_a_camera_far_from_all_others_does_not_shrink_the_scene(scene, away, caplog):
     """One wrong camera of 41 cost 11 dB in all held-out views: the learning rates are those of a scene of its size."""
     before = parse(scene)
-    path = scene / "transforms.json"
-    meta = json.loads(path.read_text())
-    wrong = json.loads(json.dumps(meta["frames"][1])) | {"file_path": "images/z.png"}
-    shutil.copy(scene / meta["frames"][1]["file_path"], scene / "images/z.png")
-    wrong["transform_matrix"][0][3] += away * np.ptp([each["transform_matrix"][0][3] for each in meta["frames"]])
-    path.write_text(json.dumps(meta | {"frames": [*meta["frames"], wrong]}))
+    with edited(scene / "transforms.json") as meta:
+        wrong = deepcopy(meta["frames"][1]) | {"file_path": "images/z.png"}
+        shutil.copy(scene / meta["frames"][1]["file_path"], scene / "images/z.png")
+        wrong["transform_matrix"][0][3] += away * np.ptp([each["transform_matrix"][0][3] for each in meta["frames"]])
+        meta["frames"].append(wrong)
     caplog.clear()
     outputs = parse(scene)
     if away == 3:
@@ -293,11 +293,10 @@ def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given
 
 
 def test_null_in_a_camera_says_nothing(scene):
-    path = scene / "transforms.json"
-    before, meta = views_of(scene)[0], json.loads(path.read_text())
-    nothing = dict.fromkeys(("k1", "k4", "p1", "distortion_params", "camera_model", "fl_x", "mask_path"))
-    meta["frames"] = [each | nothing for each in meta["frames"]]
-    path.write_text(json.dumps(meta | {"k2": None}))
+    before = views_of(scene)[0]
+    with edited(scene / "transforms.json") as meta:
+        nothing = dict.fromkeys(("k1", "k4", "p1", "distortion_params", "camera_model", "fl_x", "mask_path"))
+        meta |= {"k2": None, "frames": [each | nothing for each in meta["frames"]]}
     view = views_of(scene)[0]
     assert (view.lens, view.mask) == (None, None)
     torch.testing.assert_close(view.camera.K, before.camera.K)
@@ -365,11 +364,10 @@ def test_p1_and_p2_of_metashape_are_told_where_pixels_show_them_exchanged(scene,
 
 def test_principal_points_of_opendronemap_are_read_in_pixels(scene, caplog):
     """ns-process-data odm adds shares of the longer side to (w - 1) / 2 and (h - 1) / 2."""
-    path = scene / "transforms.json"
-    meta = json.loads(path.read_text())
-    (scene / meta["ply_file_path"]).rename(scene / "reconstruction.ply")
-    shares = {"cx": (meta["w"] - 1) / 2 + 0.01, "cy": (meta["h"] - 1) / 2 - 0.004}
-    path.write_text(json.dumps(meta | shares | {"ply_file_path": "reconstruction.ply"}))
+    with edited(scene / "transforms.json") as meta:
+        (scene / meta["ply_file_path"]).rename(scene / "reconstruction.ply")
+        shares = {"cx": (meta["w"] - 1) / 2 + 0.01, "cy": (meta["h"] - 1) / 2 - 0.004}
+        meta |= shares | {"ply_file_path": "reconstruction.ply"}
     camera = views_of(scene)[0].camera
     assert camera.K[0, 2] == pytest.approx(meta["w"] / 2 + 0.01 * meta["w"])
     assert camera.K[1, 2] == pytest.approx(meta["h"] / 2 - 0.004 * meta["w"])
@@ -484,11 +482,8 @@ def test_images_and_cameras_shrink_together(pristine_scene):
 def test_photographs_smaller_than_their_cameras_are_not_enlarged(scene, k1):
     """As those of ``--images-path images_4``: each pixel was trained on as a block of 16."""
     before = parse(scene).metadata["views"][0]
-    path = scene / "transforms.json"
-    meta = json.loads(path.read_text())
-    path.write_text(
-        json.dumps(meta | {key: 4 * meta[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")} | {"k1": k1})
-    )
+    with edited(scene / "transforms.json") as meta:
+        meta |= {key: 4 * meta[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")} | {"k1": k1}
     view = parse(scene).metadata["views"][0]
     assert load_photograph(view).shape[:2] == (view.camera.height, view.camera.width)
     if k1:
