@@ -17,11 +17,11 @@ import trimesh
 import tyro
 from jaxtyping import Float64
 
+from benchmarks.lidar import beams, lidar, places_before
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.env.world import World
 from shellgs_method.sim.formats.ground import MESH
-from shellgs_method.sim.front import Front, places_before
-from shellgs_method.sim.trials.engine import beams, lidar
+from shellgs_method.sim.front import Front
 
 FAR = 90.0
 """Length in metres that rays are compared over."""

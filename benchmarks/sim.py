@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.lidar import OUSTER, lidar_errors
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
@@ -28,17 +29,16 @@ from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import EDGE, along_normals
 from shellgs_method.sim.front import Front
-from shellgs_method.sim.report import Chapter, lidar_errors, text
+from shellgs_method.sim.report import Chapter
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
-from shellgs_method.sim.trials import engine
 from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import FacadeConfig
 
 BUDGETS = 200, 20, 10, 5
-FANS = {"Ouster OS1, ±22.5°": (-22.5, 22.5), "Velodyne VLP-16, ±15°": (-15, 15), "Livox Mid-360, -7 to 52°": (-7, 52)}
+FANS = {"Ouster OS1, ±22.5°": OUSTER, "Velodyne VLP-16, ±15°": (-15, 15), "Livox Mid-360, -7 to 52°": (-7, 52)}
 BEFORE = 0.03
 """Metres in front of the shell from which the true building deviates from it."""
 _LAYOUT = Layout(FacadeConfig.bays, FacadeConfig.storeys)
@@ -55,13 +55,14 @@ def main(
         coacd: also decompose the shell with CoACD.
     """
     console, started = Console(width=150), time.perf_counter()
-    metrics, (chapter,) = simulate([config], out, SimSettings(test=True), console.print, truths=[true_building])
+    metrics, (chapter,) = simulate([config], out, SimSettings(test=True), console.print)
     console.print(f"{time.perf_counter() - started:.0f} s")
     for sentence in metrics["summary"]:
         console.print(sentence, highlight=False)
-    _fans(console, out, chapter)
+    truth = true_building(np.linalg.inv(chapter.made.frame.to_scene))
+    _truth(console, out, chapter, truth)
     _budgets(console, chapter, coacd)
-    _deviations(console, chapter)
+    _deviations(console, chapter, truth)
 
 
 def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) -> Triangles:
@@ -71,14 +72,15 @@ def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) ->
     return Triangles(transformed(mesh.vertices, to_world @ SCENE_FROM_BUILDING), mesh.triangles[chosen])
 
 
-def _fans(console: Console, out: Path, chapter: Chapter) -> None:
-    """Print lidar errors for several fields of view."""
-    assert chapter.truth is not None
-    front, usual = Front.of(chapter.collider.surface, chapter.made.eyes), engine.BEAMS
-    for name, engine.BEAMS in FANS.items():
-        for group, errors in lidar_errors(out / "world.xml", chapter.collider.surface, front, chapter.truth).items():
-            console.print(f"{name}, {group}: {text(errors)}", highlight=False)
-    engine.BEAMS = usual
+def _truth(console: Console, out: Path, chapter: Chapter, truth: Triangles) -> None:
+    """Print distances of the collision geometry from the truth, and lidar errors for several fields of view."""
+    surface, made = chapter.collider.surface, chapter.made
+    for way, off in both_ways(surface, truth, chapter.shell, made.cameras, 0.05).items():
+        console.print(f"{way}, of the truth: {off}", highlight=False)
+    front = Front.of(surface, made.eyes)
+    for name, view in FANS.items():
+        for group, errors in lidar_errors(out / "world.xml", surface, front, truth, view).items():
+            console.print(f"{name}, {group}: {errors}", highlight=False)
 
 
 def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
@@ -115,15 +117,14 @@ def _of_coacd(shell: Triangles, resolution: int) -> Collider:
     return Collider([part for part in parts if part is not None], float("nan"))
 
 
-def _deviations(console: Console, chapter: Chapter) -> None:
+def _deviations(console: Console, chapter: Chapter, truth: Triangles) -> None:
     """Print precision and recall, by area, of the deviations in front of the shell."""
     found = chapter.deviations
     assert found is not None
-    assert chapter.truth is not None
     small, to_world = found.surface, np.linalg.inv(chapter.made.frame.to_scene)
     seen = np.isfinite(found.distance)
     claimed = seen & found.flagged & (found.distance > 0)
-    lacking = np.nan_to_num(along_normals(small, small.centres, chapter.truth)) > BEFORE
+    lacking = np.nan_to_num(along_normals(small, small.centres, truth)) > BEFORE
     # A place between two bars of a railing deviates as much as one behind a bar.
     away, _ = point_tree(small.centres[lacking]).query(small.centres)
     beside = np.asarray(away) < EDGE

@@ -1,4 +1,4 @@
-"""The facade's extent and outward direction, and places for a robot in front of it."""
+"""The facade's extent and outward direction, and places in front of it."""
 
 from __future__ import annotations
 
@@ -59,9 +59,3 @@ class Front:
         wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
         reached = float(surface.cast(wide, -self.outwards).t.min())
         return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
-
-
-def places_before(surface: Triangles, front: Front, count: int = 20) -> Float64[np.ndarray, "P 3"]:
-    """Places where a robot could stand: along the facade, one to five metres in front of it, 60 cm above the ground."""
-    shares = np.linspace(0.02, 0.98, count)
-    return np.stack([front.before(surface, share, 1.0 + k % 5, 0.6) for k, share in enumerate(shares)])

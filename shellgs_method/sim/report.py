@@ -20,10 +20,10 @@ from shellgs_method.sim.collision.distances import Distances
 from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.formats.asset import Asset
-from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.front import Front
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
-from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
+from shellgs_method.sim.trials.engine import warnings_kept
 from shellgs_method.sim.trials.trials import NoPlaceError, throw, walk
 
 IMAGES = 3
@@ -47,7 +47,6 @@ class Chapter:
         facts: sizes of the visual mesh and its files.
         deviations: deviations from the shell; None if there is none.
         distances: distances between the collision geometry and other surfaces.
-        truth: true geometry, if known.
     """
 
     asset: Asset
@@ -58,7 +57,6 @@ class Chapter:
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
-    truth: Triangles | None
 
 
 def write_report(
@@ -117,50 +115,12 @@ def _metrics(world: Path, chapter: Chapter, ground: Ground, test: bool) -> tuple
         f"{chapter.asset.name}: {len(collider.parts)} convex parts, which fill {collider.filled:.2g} m³ of air in "
         f"front of the surface; {chapter.leaks.share:.2%} of the camera rays to the building pass between them."
     ]
-    front = Front.of(surface, chapter.made.eyes)
     if test:
         with warnings_kept() as warnings:
-            walked = walk(world, surface, ground, front)
+            walked = walk(world, surface, ground, Front.of(surface, chapter.made.eyes))
         made["walk"] = asdict(walked)
         sentences += [str(walked), *(f"MuJoCo warns: {warning}" for warning in warnings)]
-    if chapter.truth is not None:
-        made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
-        sentences += [f"Lidar of the {name} against the ground truth: {text(e)}" for name, e in made["lidar"].items()]
     return made, sentences
-
-
-def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangles) -> dict[str, dict]:
-    """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
-    places, rays = places_before(collider, front), beams()
-    high = places + np.array([0, 0, 9])
-    places[:, 2] += high[:, 2] - lidar(world, high, np.array([[0.0, 0, -1]]), 0)[:, 0]  # the ground's height there
-    origins = np.repeat(places, len(rays), axis=0)
-    true = truth.cast(origins, np.tile(rays, (len(places), 1))).t
-    ground = lidar(world, places, rays, 0).ravel()
-    meets = true < ground
-    found = {}
-    for name, group in (("collision geometry", 3), ("visual mesh", 2)):
-        measured = lidar(world, places, rays, group).ravel()
-        error = np.abs(measured[meets] - true[meets])
-        median, p95 = np.quantile(np.where(np.isfinite(error), error, 1e3), [0.5, 0.95])
-        found[name] = {
-            "rays": int(meets.sum()),
-            "median": float(median),
-            "p95": float(p95),
-            "within_10cm": float((error < 0.1).mean()),
-            "missed": float(np.isinf(measured[meets]).mean()),
-            "from_nothing": float((measured < np.minimum(true, ground) - 0.1)[~meets].mean()),
-        }
-    return found
-
-
-def text(errors: Mapping[str, float]) -> str:
-    """A lidar's errors as a sentence."""
-    return (
-        f"median {100 * errors['median']:.1f} cm, 95 % within {100 * errors['p95']:.1f} cm, "
-        f"{errors['within_10cm']:.1%} within 10 cm of {errors['rays']} rays; {errors['from_nothing']:.2%} of the "
-        "others hit what is not there."
-    )
 
 
 def _section(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:

@@ -55,7 +55,6 @@ def simulate(
     out: Path,
     settings: SimSettings,
     log: Callable[[str], None] = print,
-    truths: Sequence[Callable[[np.ndarray], Triangles]] = (),
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
 
@@ -66,7 +65,6 @@ def simulate(
         out: output folder.
         settings: export settings.
         log: called with each message for the user.
-        truths: for each run, a function from the similarity (scene to world) to the true geometry, where known.
 
     Returns:
         The metrics of ``metrics.json``, and the chapters that they were computed from.
@@ -84,7 +82,7 @@ def simulate(
     earlier = _earlier_files(out)
     import_mujoco()  # fail before hours of work
     with atomic_contents(out) as folder:
-        metrics, chapters = _world(configs, folder, settings, log, truths)
+        metrics, chapters = _world(configs, folder, settings, log)
         record, files = read_json(folder / FRAME), [path.as_posix() for path in files_in(folder)]
         (folder / FRAME).write_text(json.dumps({**record, "files": files}, indent=1) + "\n")
     for path in (out / name for name in set(earlier) - set(files)):
@@ -115,21 +113,19 @@ def _world(
     out: Path,
     settings: SimSettings,
     log: Callable[[str], None],
-    truths: Sequence[Callable[[np.ndarray], Triangles]],
 ) -> tuple[dict, list[Chapter]]:
     """Write the files of :func:`simulate`."""
     names: list[str] = []
     places: dict[tuple[Path, str], Path] = {}
     chapters, home = [], None
-    for number, config in enumerate(configs):
+    for config in configs:
         run = TrainedRun.load(config)
         _refuse_twice(run, config, places)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
         names.append(_name(made.scene if len(configs) > 1 else settings.name, names))
-        truth = truths[number](np.linalg.inv(made.frame.to_scene)) if number < len(truths) else None
-        chapters.append(_building(made, out / names[-1], settings, log, truth))
+        chapters.append(_building(made, out / names[-1], settings, log))
     assert home is not None
     assets = [chapter.asset for chapter in chapters]
     ground = _common_ground([chapter.made for chapter in chapters])
@@ -160,9 +156,7 @@ def _refuse_twice(run: TrainedRun, config: Path, places: dict[tuple[Path, str], 
     places[place] = config
 
 
-def _building(
-    made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Triangles | None
-) -> Chapter:
+def _building(made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None]) -> Chapter:
     """Write the files of one building, to a folder of its name."""
     folder.mkdir(parents=True, exist_ok=True)
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
@@ -206,13 +200,11 @@ def _building(
         regions = [asdict(region) for region in deviations.regions]
         write_whole(folder / "deviations.json", json.dumps(regions, indent=1) + "\n")
     tell("Measuring the collision geometry")
-    surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
+    surfaces = ({} if shell is None else {"shell": shell}) | {"fused surface": fused}
     distances = {
-        name: both_ways(collider.surface, other, shell, made.cameras, ahead)
-        for name, other in surfaces.items()
-        if other is not None
+        name: both_ways(collider.surface, other, shell, made.cameras, ahead) for name, other in surfaces.items()
     }
-    return Chapter(asset, made, shell, collider, leaking, facts, deviations, distances, truth)
+    return Chapter(asset, made, shell, collider, leaking, facts, deviations, distances)
 
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:

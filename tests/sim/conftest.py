@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from worlds import LAYOUT, uneven, write_folder
 
+from benchmarks.lidar import beams, places_before
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.collision.collider import Collider, make_collider
-from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.front import Front
 from shellgs_method.sim.ground import LEVEL, Ground
-from shellgs_method.sim.trials.engine import beams
 from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.path import walk
 

@@ -15,9 +15,20 @@ import torch
 import trimesh
 import yourdfpy
 from PIL import Image
-from worlds import check_rays, compliance_errors, frame_at, painted, some_splats, uneven, write_building, write_folder
+from worlds import (
+    check_rays,
+    compliance_errors,
+    frame_at,
+    load,
+    painted,
+    some_splats,
+    uneven,
+    write_building,
+    write_folder,
+)
 
 from benchmarks.engines import newton_lidar, newton_model
+from benchmarks.lidar import lidar
 from shellgs_method.errors import SceneError
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -29,7 +40,7 @@ from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import visual_file, without_specks, write_visual
-from shellgs_method.sim.trials.engine import compiled, import_mujoco, lidar, load, read_spec
+from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 
 ROBOT = """
 <mujoco model="robot">

@@ -10,6 +10,7 @@ import pytest
 import torch
 from worlds import compliance_errors, frame_at, uneven
 
+from benchmarks.lidar import lidar
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
@@ -19,7 +20,6 @@ from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground, _Grid, _streets
-from shellgs_method.sim.trials.engine import lidar
 
 EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
 

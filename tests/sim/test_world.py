@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from scenes import cast, views_of
 from training_runs import trainer_of
-from worlds import LAYOUT, compliance_errors, painted, write_folder
+from worlds import LAYOUT, compliance_errors, load, painted, write_folder
 
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
@@ -33,7 +33,7 @@ from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import OUTDATED, simulate
 from shellgs_method.sim.trials import trials
-from shellgs_method.sim.trials.engine import compiled, import_mujoco, load, warnings_kept
+from shellgs_method.sim.trials.engine import compiled, import_mujoco, warnings_kept
 from shellgs_method.sim.trials.trials import SIZES, Passages, throw, walk
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll

@@ -22,11 +22,17 @@ from shellgs_method.sim.frame import SimFrame
 from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import write_visual
+from shellgs_method.sim.trials.engine import compiled, read_spec
 from shellgs_method.synthetic.building import Layout
 
 LAYOUT = Layout(bays=2, storeys=1)
 BLUR = 0.003
 """Metres beside a ray in which an engine may see an edge that the ray itself misses: engines round hulls."""
+
+
+def load(path: Path):
+    """A model as MuJoCo compiles it; refused if MuJoCo warns."""
+    return compiled(read_spec(path), path)
 
 
 def painted(surface: Triangles) -> TexturedMesh:

@@ -1,4 +1,4 @@
-"""Load worlds in MuJoCo without warnings, and simulate a lidar in them."""
+"""Load worlds in MuJoCo without warnings, and cast rays in them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.machine.extras import import_extra
-
-BEAMS = -22.5, 22.5
-"""Vertical field of view of the lidar in degrees: that of an Ouster OS1."""
 
 
 def import_mujoco() -> ModuleType:
@@ -68,30 +65,6 @@ def compiled(spec, path: Path):
     return model
 
 
-def load(path: Path):
-    """Load and compile an MJCF file.
-
-    Raises:
-        SceneError: MuJoCo refuses it, or warns.
-    """
-    return compiled(read_spec(path), path)
-
-
-def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarray, "R 3"], group: int) -> np.ndarray:
-    """Distances [P, R] in metres that a lidar measures in MuJoCo; inf where nothing is hit.
-
-    Args:
-        path: model file.
-        places: positions of the lidar.
-        rays: unit directions.
-        group: group of the geoms to hit, beside the ground: 3 for collision geometry, 2 for visual meshes, 0 for none.
-    """
-    mujoco, model = import_mujoco(), load(path)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return np.stack([cast_rays(model, data, place, rays, (0, group), fixed=True)[0] for place in places])
-
-
 def cast_rays(
     model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"], groups: Sequence[int], fixed: bool
 ) -> tuple[Float64[np.ndarray, " R"], np.ndarray, Float64[np.ndarray, "R 3"]]:
@@ -111,11 +84,3 @@ def cast_rays(
         geoms, distances, normals.reshape(-1, 1), len(rays), 1e3,
     )  # fmt: skip
     return np.where(distances < 0, np.inf, distances), geoms, normals
-
-
-def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
-    """Unit directions of a lidar with a horizontal field of view of 360 degrees."""
-    up, around = np.meshgrid(
-        np.radians(np.linspace(*BEAMS, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
-    )
-    return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1).reshape(-1, 3)
