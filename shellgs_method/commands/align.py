@@ -29,38 +29,49 @@ class RefusedError(SceneError):
     """The validation refuses the alignment, and the report shows why."""
 
 
-@dataclass(frozen=True)
-class AlignConfig:
-    """Settings of an alignment."""
+@dataclass(frozen=True, kw_only=True)
+class AlignStart:
+    """Where an alignment starts and how it goes on: settings of `shellgs align` and of `shellgs run`."""
 
-    shell: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]", help_behavior_hint="")
-    ] = ()
-    """Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates."""
     matrix: Optional[Path] = None
     """File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy)."""
     picks: Optional[Path] = None
     """Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name."""
     positions: Optional[Path] = None
     """Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates."""
+    same_frame: bool = False
+    """Shell and cameras are in one frame and unit, as from a project of Metashape, RealityScan or OpenDroneMap."""
     refine: Optional[Length] = None
     """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
     bundle_adjust: bool = False
     """Then adjust the cameras to the shell, to correct bending, if the alignment is not refused.
     They are written to colmap/adjusted, which is used from then on.
     Without this option, or with --colmap-path, the original cameras are used."""
-    accept: bool = False
-    """Accept the earlier proposal."""
-    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """CloudCompare's global shift, with --matrix."""
     metres_per_shell_unit: Optional[Length] = None
     """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
-    same_frame: bool = False
-    """Shell and cameras are in one frame and unit, as from a project of Metashape, RealityScan or OpenDroneMap."""
     crs: Optional[str] = None
     """Coordinate reference system of the shell, such as EPSG:25832.
     Picks and positions whose first line names another one, such as EPSG:4326 for degrees, are converted.
     If not set: as the shell's file says, or a .prj beside it, else that in which the same files were aligned before."""
+
+    @property
+    def starts(self) -> list[str]:
+        """Names of the settings that say what the alignment starts from; none for a proposal."""
+        return [name for name in ("matrix", "picks", "positions", "same_frame") if getattr(self, name)]
+
+
+@dataclass(frozen=True)
+class AlignConfig(AlignStart):
+    """Settings of an alignment."""
+
+    shell: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]", help_behavior_hint="")
+    ] = ()
+    """Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates."""
+    accept: bool = False
+    """Accept the earlier proposal."""
+    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """CloudCompare's global shift, with --matrix."""
     mesher: Optional[Mesher] = None
     """How a point cloud is meshed, here and wherever the alignment is used:
     planes (ball pivoting between them), bpa (ball pivoting alone) or poisson (for round shapes).
@@ -76,7 +87,7 @@ class AlignConfig:
             SceneError: says what to give.
         """
         check_bounds(AlignConfig, vars(self))
-        starts = [start for start in (self.matrix, self.picks, self.positions, self.same_frame) if start]
+        starts = self.starts
         if len(starts) > 1 or (starts and not self.shell) or (self.accept and (self.shell or starts)):
             raise SceneError(
                 "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to "

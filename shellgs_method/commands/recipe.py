@@ -7,18 +7,19 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import tyro
 
-from shellgs_method.bounds import FromOne, Length, check_bounds
+from shellgs_method.bounds import FromOne, check_bounds
+from shellgs_method.commands.align import AlignStart
 from shellgs_method.commands.sim import check_packages
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import write_whole
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(AlignStart):
     """Settings of all steps."""
 
     sources: Annotated[
@@ -27,22 +28,6 @@ class Recipe:
         tyro.conf.arg(metavar="[VIDEO SHELL [SHELL ...]]", help_behavior_hint=""),
     ] = ()
     """Video or folder of photographs, then the files of the shell. Not needed to resume a run."""
-    picks: Optional[Path] = None
-    """Text file of picked points, as `shellgs align` takes it."""
-    matrix: Optional[Path] = None
-    """File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy)."""
-    positions: Optional[Path] = None
-    """Text file of RTK camera positions, as `shellgs align` takes it."""
-    same_frame: bool = False
-    """The shell is in the frame and unit of the cameras: both come from one photogrammetry project."""
-    refine: Optional[Length] = None
-    """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
-    bundle_adjust: bool = False
-    """Then adjust the cameras to the shell."""
-    metres_per_shell_unit: Optional[Length] = None
-    """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
-    crs: Optional[str] = None
-    """Coordinate reference system of the shell, such as EPSG:25832. If not set: as the shell's file says."""
     max_image_size: Optional[FromOne] = None
     """Longer side in pixels that photographs are resized to for training. If not set: full size."""
     method: str = "shellgs-metric"
@@ -51,12 +36,6 @@ class Recipe:
     """Training iterations."""
     sim: bool = False
     """Also write a folder for simulators."""
-
-    @property
-    def starts(self) -> dict[str, Any]:
-        """What the alignment starts from, as settings of :func:`align`; nothing for a proposal."""
-        given = {name: getattr(self, name) for name in ("matrix", "picks", "positions", "same_frame")}
-        return {name: value for name, value in given.items() if value}
 
     def located(self, place: Callable[[Path], Path]) -> Recipe:
         """The recipe with other paths."""
@@ -86,9 +65,9 @@ class Recipe:
             return shlex.quote(str(value.resolve() if isinstance(value, Path) else value))
 
         lines = [" ".join(map(word, self.sources))]
-        for field in fields(self)[1:]:
+        for field in fields(self):
             value = getattr(self, field.name)
-            if value != field.default:
+            if field.name != "sources" and value != field.default:
                 lines.append(_flag(field.name) + ("" if value is True else f" {word(value)}"))
         write_whole(file, "\n".join(["# Settings of `shellgs run`: change them, and run it again.", *lines, ""]))
 

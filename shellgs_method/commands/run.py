@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from importlib import metadata
 from itertools import count
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.commands.align import AlignConfig, RefusedError, align
+from shellgs_method.commands.align import AlignConfig, AlignStart, RefusedError, align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
 from shellgs_method.commands.common import better_start, console, open_page, resumable
@@ -151,8 +152,8 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     try:
         if not done.has("align", key) or not _is_there(written, scene):
             adjust = recipe.bundle_adjust and not proposed
-            given = {"refine": recipe.refine, "metres_per_shell_unit": unit, "crs": recipe.crs}
-            align(scene, AlignConfig(shell, **recipe.starts, **given, bundle_adjust=adjust))
+            given = {field.name: getattr(recipe, field.name) for field in fields(AlignStart)}
+            align(scene, AlignConfig(shell, **{**given, "bundle_adjust": adjust}))
             if proposed:  # it is seen first
                 done.forget("accepted")
                 accept = accepted = False
