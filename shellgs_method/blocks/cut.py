@@ -20,7 +20,7 @@ from shellgs_method.gaussians.skybox import skybox_radius
 from shellgs_method.gaussians.surroundings import FAR
 from shellgs_method.geometry.camera import world_rays
 from shellgs_method.geometry.planes import across
-from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.geometry.similarity import affine, scale_of, transformed
 
 SHARE = 0.05
 """Share of a photograph's points that lie in a block's extended region from which it belongs to the block."""
@@ -66,8 +66,7 @@ class Sights:
         """
         x = across(up)
         turn = np.stack([x, np.cross(up, x), up])  # rows: the axes of the upright frame
-        to_scene = np.eye(4)
-        to_scene[:3, :3] = turn.T / (metres_per_unit or assumed)
+        to_scene = affine(turn.T / (metres_per_unit or assumed))
         views = np.repeat(np.arange(len(points)), [len(of) for of in points.values()])
         seen = np.concatenate([*points.values(), np.empty((0, 3))])
         of_lengths = ("m", 1.0) if metres_per_unit else ("scene units", assumed)

@@ -15,7 +15,7 @@ from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.crs import in_metres
 from shellgs_method.geometry.axes import name_of, turn
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.similarity import scale_of
+from shellgs_method.geometry.similarity import affine, scale_of
 from shellgs_method.shell import Alignment, ShellMesh
 
 Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -67,8 +67,7 @@ class Frame:
 
     def turned(self, up: Float64[np.ndarray, " 3"]) -> tuple[Frame, Float64[np.ndarray, "4 4"]]:
         """This frame with its up axis turned to another direction, and the motion from this one to it."""
-        motion = np.eye(4)
-        motion[:3, :3] = turn(self.up, up)
+        motion = affine(turn(self.up, up))
         to_scene = self.to_scene @ motion.T
         return replace(self, to_scene=to_scene, offset=motion[:3, :3] @ self.offset, up=up), motion
 
@@ -83,9 +82,7 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, 
     metres = alignment.metres_per_shell_unit
     bounds = shell.bounds * metres
     offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
-    to_shell = np.diag([1 / metres] * 3 + [1.0])
-    to_shell[:3, 3] = offset / metres
-    to_scene = alignment.shell_to_scene @ to_shell
+    to_scene = alignment.shell_to_scene @ affine(np.eye(3) / metres, offset / metres)
     return Frame("shell", to_scene, offset, metric=True, up=up, crs=in_metres(alignment.crs))
 
 
@@ -98,6 +95,4 @@ def scene_frame(up: Float64[np.ndarray, " 3"] = Z, middle: Float64[np.ndarray, "
     """
     middle = np.zeros(3) if middle is None else middle
     offset = np.round(middle, -2) if np.abs(middle).max() > FAR else np.zeros(3)
-    to_scene = np.eye(4)
-    to_scene[:3, 3] = offset
-    return Frame("scene", to_scene, offset, metric=False, up=up)
+    return Frame("scene", affine(np.eye(3), offset), offset, metric=False, up=up)

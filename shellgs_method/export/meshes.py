@@ -14,6 +14,7 @@ from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.transfer import linear_of
 from shellgs_method.files.usd import USD_FORMATS, add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.axes import name_of, turn
+from shellgs_method.geometry.similarity import affine
 
 if TYPE_CHECKING:
     import trimesh
@@ -49,9 +50,7 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     stated = {".glb": ("y",), **dict.fromkeys(USD_FORMATS, ("y", "z"))}.get(format)
     if stated and name_of(up) not in stated:
         to = np.eye(3)["xyz".index(stated[-1])]
-        turned = np.eye(4)
-        turned[:3, :3] = turn(up, to)
-        mesh, up = mesh.copy().apply_transform(turned), to
+        mesh, up = mesh.copy().apply_transform(affine(turn(up, to))), to
     if format in USD_FORMATS:
         _write_usd(path, mesh, "y" if name_of(up) == "y" else "z", frame.metric)
     else:

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+
+def affine(linear: Float64[np.ndarray, "3 3"], shift: ArrayLike = 0.0) -> Float64[np.ndarray, "4 4"]:
+    """The map that applies a matrix to points, and then shifts them."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return matrix
 
 
 def transformed(
@@ -24,14 +32,10 @@ def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarra
     source, target = source - centre, target - goal
     u, s, vt = np.linalg.svd(target.T @ source)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    matrix = np.eye(4)
-    matrix[:3, :3] = (s @ signs) / (source**2).sum() * (u * signs) @ vt
-    matrix[:3, 3] = goal - matrix[:3, :3] @ centre
-    return matrix
+    linear = (s @ signs) / (source**2).sum() * (u * signs) @ vt
+    return affine(linear, goal - linear @ centre)
 
 
 def centred(centre: Float64[np.ndarray, " 3"], scale: float) -> Float64[np.ndarray, "4 4"]:
     """Similarity that moves a point to the origin and scales, without rotation."""
-    matrix = np.diag([scale] * 3 + [1.0])
-    matrix[:3, 3] = -scale * centre
-    return matrix
+    return affine(scale * np.eye(3), -scale * centre)

@@ -13,7 +13,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Frame, Z
 from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.camera import Camera, positions
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import affine, transformed
 
 FRAME = "frame.json"
 """Record of a world: its frame, buildings, trusted workspace and files."""
@@ -62,11 +62,10 @@ def sim_frame(
         SceneError: the ground is far from the surface's lower edge.
     """
     from_scene = np.linalg.inv(frame.to_scene)
-    upright = np.eye(4)
-    upright[:3, :3] = turn(frame.up, Z)
-    offset = upright[:3, :3] @ frame.offset
-    points = transformed(surface, upright) + offset
-    origin = np.median(transformed(transformed(positions(cameras), from_scene), upright), axis=0) + offset
+    upright = turn(frame.up, Z)
+    in_place = affine(upright, upright @ frame.offset)
+    points = transformed(surface, in_place)
+    origin = np.median(transformed(transformed(positions(cameras), from_scene), in_place), axis=0)
     lowest = float(np.quantile(points[:, 2], LOWEST))
     if ground is not None and abs(ground * unit - lowest) > MAX_STEP:
         surfaces, metre = ("shell", " m") if frame.metric else ("reconstruction", "")
@@ -76,18 +75,7 @@ def sim_frame(
         )
     origin[2] = lowest if ground is None else ground * unit
     origin[:2] = np.round(origin[:2]) if frame.metric else origin[:2]
-    motion = upright.copy()
-    motion[:3, 3] = offset - origin
-    back = np.linalg.inv(motion)
-    to_national = np.eye(4)
-    to_national[:3, :3], to_national[:3, 3] = upright[:3, :3].T, upright[:3, :3].T @ origin
-    sim = SimFrame(
-        frame.name,
-        frame.to_scene @ back,
-        origin,
-        frame.metric,
-        Z,
-        to_national if frame.metric else np.eye(4),
-        crs=frame.crs,
-    )
-    return sim, motion
+    motion = affine(upright, upright @ frame.offset - origin)
+    to_scene = frame.to_scene @ np.linalg.inv(motion)
+    to_national = affine(upright.T, upright.T @ origin) if frame.metric else np.eye(4)
+    return SimFrame(frame.name, to_scene, origin, frame.metric, Z, to_national, crs=frame.crs), motion

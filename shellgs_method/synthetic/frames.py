@@ -6,26 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.geometry.camera import Camera
-
-
-def _similarity(scale: float, turn: Rotation, shift: list[float]) -> Float64[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = scale * turn.as_matrix()
-    matrix[:3, 3] = shift
-    return matrix
-
+from shellgs_method.geometry.similarity import affine
 
 UNITS_PER_METRE = 0.37
 
 # SfM recovers neither scale nor orientation of the world; a survey has metres and national coordinates.
-SCENE_FROM_BUILDING = _similarity(
-    UNITS_PER_METRE, Rotation.from_euler("ZYX", [-37, 24, 101], degrees=True), [1.9, -0.6, 2.3]
+SCENE_FROM_BUILDING = affine(
+    UNITS_PER_METRE * Rotation.from_euler("ZYX", [-37, 24, 101], degrees=True).as_matrix(), [1.9, -0.6, 2.3]
 )
-SHELL_FROM_BUILDING = _similarity(1.0, Rotation.from_euler("Z", 31, degrees=True), [412_345.678, 5_123_456.789, 212.34])
+SHELL_FROM_BUILDING = affine(
+    Rotation.from_euler("Z", 31, degrees=True).as_matrix(), [412_345.678, 5_123_456.789, 212.34]
+)
 
 
 def scene_camera(camera: Camera) -> Camera:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.bounds import Bounds, FromOne, Pixels, Seed, check_bounds
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import affine, transformed
 from shellgs_method.synthetic.appearance import Daylight, log_gains, noise_lattice
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.geometry import Material, Mesh, merge, moved, parallelogram
@@ -95,9 +95,7 @@ class Street(Site):
         count = config.houses + 1
         sides = _rows(count, plan)
         length = max(_length(side) for side in sides)
-        turned = np.eye(4)
-        turned[:3, :3] = Rotation.from_euler("Z", 180, degrees=True).as_matrix()
-        turned[:3, 3] = length, -WIDTH, 0.0
+        turned = affine(Rotation.from_euler("Z", 180, degrees=True).as_matrix(), (length, -WIDTH, 0.0))
         houses: list[House] = []
         cameras: list[Camera] = []
         parts: list[Mesh] = []
@@ -135,9 +133,7 @@ def _rows(count: int, rng: np.random.Generator) -> tuple[list[House], list[House
         storeys = rng.choice([each for each in _STOREYS if each != storeys])
         setback = rng.choice([each for each in _SETBACKS if each != setback])
         layout = Layout(int(rng.choice(_BAYS)), int(storeys), first=_NUMBERS * number)
-        motion = np.eye(4)
-        motion[:3, 3] = x - layout.ends[0], setback, 0.0
-        place = Place(motion, _TINTS[number % len(_TINTS)])
+        place = Place(affine(np.eye(3), (x - layout.ends[0], setback, 0.0)), _TINTS[number % len(_TINTS)])
         houses.append(House(layout, place, is_scanned=number != near + 1))
         x += layout.ends[1] - layout.ends[0]
     return houses[:near], houses[near:]
@@ -151,7 +147,6 @@ def _pavement(row: list[House], length: float, rng: np.random.Generator) -> Iter
     """The half of the ground on one side, and a pole and a tree in front of each house, in the row's frame."""
     yield parallelogram((-60, -WIDTH / 2, 0), (length + 120, 0, 0), (0, 60, 0), Material.GROUND)
     for house in row:
-        along = np.eye(4)
-        along[0, 3] = house.ends[0, 0]
+        along = affine(np.eye(3), (house.ends[0, 0], 0.0, 0.0))
         for mesh in pole_and_tree(house.layout.length, rng):
             yield moved(mesh, along)

@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import affine
 
 FIELD_OF_VIEW = 67.0
 """Horizontal field of view of a phone's main camera, in degrees."""
@@ -40,19 +41,11 @@ def walk(length: float, views: int, width: int, height: int, rng: np.random.Gene
     focal = 0.5 * width / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return [
-        Camera(torch.from_numpy(_viewmat(rotation, centre)), K, width, height)
-        for rotation, centre in zip(rotations, centres, strict=True)
+        Camera(torch.from_numpy(affine(axes.T, -axes.T @ centre)), K, width, height)
+        for axes, centre in zip(rotations, centres, strict=True)
     ]
 
 
 def _progress(views: int) -> np.ndarray:
     """Positions from 0 to 1, slow at the ends, so that the outermost views overlap well with their neighbours."""
     return (1 - np.cos(np.pi * np.linspace(0, 1, views))) / 2
-
-
-def _viewmat(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """World to camera from the camera's axes (columns) and its centre in the world."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ centre
-    return viewmat

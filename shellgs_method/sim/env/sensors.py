@@ -13,6 +13,7 @@ from torch import Tensor
 
 from shellgs_method.files.splats import Splats, read_splats
 from shellgs_method.geometry.camera import Camera, world_rays
+from shellgs_method.geometry.similarity import affine
 from shellgs_method.render.view import ViewRenderer
 from shellgs_method.sim.env.world import HIDDEN, MOVING, World
 from shellgs_method.sim.trials.engine import cast_rays
@@ -83,9 +84,7 @@ def cast(
 
 def camera_of(model, data, number: int, width: int, height: int) -> Camera:
     """A camera of MuJoCo's: of one with a sensor, the image shows all of that, whatever the shape of either."""
-    pose = np.eye(4)
-    pose[:3, :3] = data.cam_xmat[number].reshape(3, 3) * [1, -1, -1]  # from OpenGL's axes
-    pose[:3, 3] = data.cam_xpos[number]
+    pose = affine(data.cam_xmat[number].reshape(3, 3) * [1, -1, -1], data.cam_xpos[number])  # from OpenGL's axes
     pixels, sensor = np.array([width, height]), model.cam_sensorsize[number]
     focal, middle = np.full(2, height / 2 / np.tan(np.radians(model.cam_fovy[number]) / 2)), pixels / 2
     if sensor.all():  # in metres, as are its focal lengths and the shift of its principal point
