@@ -29,7 +29,7 @@ def rasterize(
     primitive: Literal["3d", "2d"] = "3d",
 ) -> tuple[Float[Tensor, "height width C"], Float[Tensor, "height width 1"], dict[str, Tensor]]:
     """Same as :func:`shellgs_method.render.rasterizer.rasterize`, with only the maps in the info."""
-    projection = PROJECT[primitive](Ellipsoids(means, quats, scales, opacities), [camera])
+    projection = PROJECT[primitive](Ellipsoids(means, quats, scales, opacities), camera)
     values = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
     rows = []
     for top in range(0, camera.height, TILE):
@@ -64,7 +64,7 @@ def _tile(
     height: int,
 ) -> Float[Tensor, "height width C+maps"]:
     splats = _touching(projection, left, top, width, height)
-    splats = splats[projection.depths[0, splats].argsort(stable=True)]
+    splats = splats[projection.depths[splats].argsort(stable=True)]
     z, inverse_depth = _meet(projection, splats, primitive, left, top, width, height)
     alpha = torch.where(z <= Z_MAX, ALPHA_MAX * torch.exp2(-z.relu()), 0.0)
     behind = (1 - alpha).cumprod(dim=1)
@@ -82,10 +82,10 @@ def _touching(projection: Projection, left: int, top: int, width: int, height: i
     """Indices of the splats with an outline whose box touches a tile."""
     low, high = torch.tensor([left, top]), torch.tensor([left + width, top + height])
 
-    outlines = projection.outlines[0]
+    outlines = projection.outlines
     centres, reach = outlines[..., :2], outlines[..., 5:]
     touch = ((centres + reach > low) & (centres - reach < high)).all(dim=-1)
-    return (touch.any(dim=1) & projection.visible[0]).nonzero().squeeze(1)
+    return (touch.any(dim=1) & projection.visible).nonzero().squeeze(1)
 
 
 def _meet(
@@ -102,9 +102,9 @@ def _meet(
     u, v = projection.means2d[0, splats].unbind(-1)
     dx, dy = x.reshape(-1, 1) - u, y.reshape(-1, 1) - v
     if primitive == "3d":
-        a, b, c, n = projection.shapes[0, splats].unbind(-1)
+        a, b, c, n = projection.shapes[splats].unbind(-1)
         return a * dx * dx + b * dx * dy + c * dy * dy + n, torch.ones_like(dx)
-    a, b, c, d, p, q, r, n = projection.shapes[0, splats].unbind(-1)
+    a, b, c, d, p, q, r, n = projection.shapes[splats].unbind(-1)
     inverse_depth = p + q * dx + r * dy
     in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)
     inverse_depth = torch.where(in_front, inverse_depth, p)

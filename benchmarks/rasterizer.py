@@ -187,7 +187,7 @@ def _resident(field: str) -> float:
 def pairs(case: Case) -> int:
     """(splat, pixel) pairs inside the footprints of a scene."""
     scene, camera = case.scene
-    projection = naive.PROJECT[case.primitive](Ellipsoids(*scene.splats(0)[:4]), [camera])
+    projection = naive.PROJECT[case.primitive](Ellipsoids(*scene.splats(0)[:4]), camera)
     return naive.count_pairs(projection, case.primitive, case.width, case.height)
 
 

@@ -106,15 +106,13 @@ class GradientStrategy(DefaultStrategy):
         trained = radii.shape[1] - info.get("frozen", 0)
         if trained != len(params["means"]):
             return  # broken ones were removed since, and nobody knows which of these are left
-        gradients = centres.grad[:, :trained]
-        radii = radii[:, :trained]
-        half = (size / 2 * len(radii) for size in (info["width"], info["height"]))
+        gradients, radii = centres.grad[0, :trained], radii[0, :trained].to(centres)
+        half = (size / 2 for size in (info["width"], info["height"]))
         scale = constant(*half, 1 / max(info["width"], info["height"]), like=gradients)
         skipped = info.get("skipped", constant(0.0, like=gradients)[0])[None]
-        for gradient, radius in zip(gradients.unbind(0), radii.to(gradients).unbind(0), strict=True):
-            sums = (state[gathered][:, None] for gathered in ("grad2d", "count", "radii"))
-            added = elementwise(_added, gradient, radius[:, None], scale, skipped, *sums)
-            state["grad2d"], state["count"], state["radii"] = (each[:, 0] for each in added)
+        sums = (state[gathered][:, None] for gathered in ("grad2d", "count", "radii"))
+        added = elementwise(_added, gradients, radii[:, None], scale, skipped, *sums)
+        state["grad2d"], state["count"], state["radii"] = (each[:, 0] for each in added)
 
     @torch.no_grad()
     def _grow_gs(

@@ -37,8 +37,8 @@ def splat_maps(project: Callable, make: Callable, device: str) -> tuple[Callable
     camera = make_camera(61, 45).to(device, torch.float32)
 
     def projected(*splats: Tensor) -> list[Tensor]:
-        projection = project(Ellipsoids(*splats), [camera, camera])
-        bins = bin_splats(projection.outlines[0], 61, 45)
+        projection = project(Ellipsoids(*splats), camera)
+        bins = bin_splats(projection.outlines, 61, 45)
         return [projection.means2d, projection.shapes, bins.counts, projection.visible]
 
     return projected, [each.to(device, torch.float32) for each in make(300, 3, 1)[:4]]

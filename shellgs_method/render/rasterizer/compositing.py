@@ -21,7 +21,7 @@ from shellgs_method.render.rasterizer.binning import TILE, Bins, stable_order
 from shellgs_method.render.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 from shellgs_method.render.rasterizer.loops import Chunk, Loops
 from shellgs_method.render.rasterizer.plans import CHUNK, LANES, Plan, Strips
-from shellgs_method.render.rasterizer.projection import View
+from shellgs_method.render.rasterizer.projection import Projection
 
 # Tiles per batch, and chunks between checks of which tiles are still active. Small batches stay in a CPU's cache, large
 # ones need fewer kernel calls; a GPU is only busy with large ones, and each check makes the host wait for it.
@@ -34,7 +34,7 @@ MAX_STRIPS = 16  # strips of one tile
 
 
 def composite(
-    view: View,
+    projection: Projection,
     features: Float[Tensor, "N C"],
     order: Int[Tensor, " n"],
     bins: Bins,
@@ -44,14 +44,15 @@ def composite(
     """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
     Args:
-        view: the splats; ``probed`` gets the gradient of the first ``n_densifying`` features alone.
+        projection: the splats; ``probed`` gets the gradient of the first ``n_densifying`` features alone.
         features: any channels.
         order: indices of the splats in the bins, front to back.
         bins: bins of the splats in this order.
         kernels: kernels of the primitive.
         n_densifying: number of these features.
     """
-    return _Composite.apply(view.means2d, view.shapes, features, view.probed, order, bins, kernels, n_densifying)
+    means2d, shapes, probed = projection.means2d.squeeze(0), projection.shapes, projection.probed
+    return _Composite.apply(means2d, shapes, features, probed, order, bins, kernels, n_densifying)
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from shellgs_method.render.rasterizer.projection import (
     Projection,
     cutoffs,
     halvings,
+    parameters_of,
     rotate,
     rotated_axes,
-    stack_cameras,
     to_camera,
 )
 from shellgs_method.render.rasterizer.renders import Ellipsoids
@@ -30,7 +30,7 @@ EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which si
 MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # depth range of the distortion, as in 2DGS
 
 
-def project_discs(splats: Ellipsoids, cameras: Sequence[Camera], with_probe: bool = False) -> Projection:
+def project_discs(splats: Ellipsoids, camera: Camera, with_probe: bool = False) -> Projection:
     """Project discs with half-axes s_u t_u and s_v t_v, a splat's first two; means2d and shapes are differentiable.
 
     A ray z r (r_z = 1) meets the plane through m with normal n = t_u × t_v at depth z = n·m / n·r, where
@@ -41,18 +41,21 @@ def project_discs(splats: Ellipsoids, cameras: Sequence[Camera], with_probe: boo
     The centres in the camera frame are computed from ``means2d`` and depths, so that the gradient w.r.t. ``means2d``
     is the full effect of moving the disc parallel to the screen: hence two kernels, with ``means2d`` between them.
     """
-    (means, quats, scales, opacities), views = splats, stack_cameras(cameras)
+    (means, quats, scales, opacities), view = splats, parameters_of(camera)
     opacities = opacities[:, None]
-    means2d, depths, in_front = elementwise(_project_centres, means, *views[:2])
-    shapes, outlines, covars2d, visible = elementwise(_project, means2d, depths, quats, scales, opacities, *views)
-    visible = (visible[..., 0] > 0) & (in_front[..., 0] > 0)
-    projection = Projection(means2d, shapes, depths[..., 0].detach(), outlines.unflatten(-1, (2, 7)), covars2d, visible)
+    means2d, depths, in_front = elementwise(_project_centres, means, *view[:2])
+    found = elementwise(_project, means2d, depths, quats, scales, opacities, *view)
+    shapes, outlines, covars2d, visible = (each.squeeze(0) for each in found)
+    visible = (visible[:, 0] > 0) & (in_front[0, :, 0] > 0)
+    outlines = outlines.unflatten(-1, (2, 7))
+    projection = Projection(means2d, shapes, depths[0, :, 0].detach(), outlines, covars2d, visible)
     if not with_probe:
         return projection
     probe = means2d.detach().requires_grad_()
     fixed = (each.detach() for each in (depths, quats, scales, opacities))
-    shapes = elementwise(_project, probe, *fixed, *views)[0]
-    return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
+    shapes = elementwise(_project, probe, *fixed, *view)[0]
+    probed = torch.cat([probe, shapes[..., :-1]], dim=-1)  # all but n
+    return replace(projection, probe=probe, probed=probed.squeeze(0))
 
 
 def _project_centres(mean: Vector, viewmat: Vector, intrinsics: Vector) -> list[Vector]:
@@ -104,19 +107,18 @@ def _project(
 
 
 def disc_maps(
-    alpha: Float[Tensor, "*batch 1"],
-    inverse_depth: Float[Tensor, "*batch 1"],
-    square: Float[Tensor, "*batch 1"],
-    median_depth: Float[Tensor, "*batch 1"],
-) -> dict[str, Float[Tensor, "*batch 1"]]:
+    alpha: Float[Tensor, "height width 1"],
+    inverse_depth: Float[Tensor, "height width 1"],
+    square: Float[Tensor, "height width 1"],
+    median_depth: Float[Tensor, "height width 1"],
+) -> dict[str, Float[Tensor, "height width 1"]]:
     """Geometry maps of a disc render, from its composited 1/z and 1/z² and its median z.
 
     Distortion is the L2 form of 2DGS, sum over i and j < i of w_i w_j (m_i - m_j)², with depths mapped to
     m = far / (far - near) (1 - near / z). It equals A Σ w m² - (Σ w m)², A = Σ w, in which the constant of the mapping
     cancels; leaving it out avoids rounding errors.
     """
-    flat = (each.flatten(0, -3) if each.dim() > 3 else each for each in (alpha, inverse_depth, square))
-    distortion = elementwise(_distortion, *flat)[0].view_as(alpha)
+    (distortion,) = elementwise(_distortion, alpha, inverse_depth, square)
     return {"inverse_depth": inverse_depth, "median_depth": median_depth, "distortion": distortion}
 
 

@@ -66,31 +66,33 @@ def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
 
 
 def rasterize_3d(
-    splats: Ellipsoids, features: Float[Tensor, "N C"], cameras: Sequence[Camera], n_densifying: int | None
+    splats: Ellipsoids, features: Float[Tensor, "N C"], camera: Camera, n_densifying: int | None
 ) -> Renders:
-    """Rasterize Gaussians for cameras of one size; all tensors are float32 on a CUDA device.
+    """Rasterize Gaussians; all tensors are float32 on a CUDA device.
 
     The render equals that of the torch backend, except that gsplat 1.4 culls splats beside the image that reach into it
     only beyond three standard deviations, where alpha is below 0.012.
     """
-    (means, quats, scales, opacities), (viewmats, Ks, width, height) = splats, _stack(cameras)
+    (means, quats, scales, opacities), (width, height) = splats, (camera.width, camera.height)
     radii, means2d, depths, conics, _ = fully_fused_projection(
-        means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
+        *(means, None, quats, scales, camera.viewmat[None], camera.K[None], width, height),
+        eps2d=LOW_PASS,
+        near_plane=NEAR_PLANE,
+        packed=False,
     )
     tile_radii, sizes = _extents(means2d, conics, radii, opacities, width, height)
     bins = _bin(means2d, tile_radii, depths, width, height)
     probe, groups = _probed(means2d, features, n_densifying)
     renders = [
-        rasterize_to_pixels(
-            *(centres, conics, _of_each(cameras, group), _of_each(cameras, opacities), width, height, TILE, *bins)
-        )
+        rasterize_to_pixels(centres, conics, group[None], opacities[None], width, height, TILE, *bins)
         for centres, group in groups
     ]
-    return Renders(_joined([render for render, _ in renders], dim=-1), renders[-1][1], (), probe, sizes)
+    composited = _joined([render.squeeze(0) for render, _ in renders])
+    return Renders(composited, renders[-1][1].squeeze(0), (), probe, sizes)
 
 
 def rasterize_2d(
-    splats: Ellipsoids, features: Float[Tensor, "N C"], cameras: Sequence[Camera], n_densifying: int | None
+    splats: Ellipsoids, features: Float[Tensor, "N C"], camera: Camera, n_densifying: int | None
 ) -> Renders:
     """Rasterize the discs of 2DGS (Huang et al. 2024).
 
@@ -101,45 +103,31 @@ def rasterize_2d(
     The render equals that of the torch backend, except that gsplat culls by its radii, and
     that all of a nearly edge-on disc has the depth of its centre in the maps.
     """
-    discs = _project_discs(splats, cameras)
+    discs = _project_discs(splats, camera)
     probe, groups = _probed(discs.means2d, features, n_densifying)
-    views = []
-    for i, camera in enumerate(cameras):
-        # One camera at a time: gsplat 1.4 writes all normals of a batch into those of its first (its issue #425).
-        disc = discs.of_view(i)
-        bins = _bin(disc.means2d, disc.tile_radii, disc.depths, camera.width, camera.height)
-        *others, (_, last) = groups
-        composited = [_composite_discs(disc.moved(_of_view(to, i)), bins, each, camera) for to, each in others]
-        *rendered, alpha, maps = _composite_with_maps(disc, bins, last, camera)
-        views.append((_joined([*composited, *rendered], dim=-1), alpha, *maps))
-    composited, alpha, *maps = (_joined(each, dim=0) for each in zip(*views, strict=True))
-    return Renders(composited, alpha, tuple(maps), probe, discs.radii)
+    bins = _bin(discs.means2d, discs.tile_radii, discs.depths, camera.width, camera.height)
+    *others, (_, last) = groups
+    composited = [_composite_discs(discs.moved(to), bins, each, camera) for to, each in others]
+    rendered, alpha, *maps = _composite_with_maps(discs, bins, last, camera)
+    return Renders(_joined([*composited, rendered]), alpha, tuple(maps), probe, discs.radii)
 
 
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
 
 
-def _of_each(cameras: Sequence[Camera], of_splats: Float[Tensor, " N *k"]) -> Float[Tensor, "B N *k"]:
-    return of_splats[None].expand(len(cameras), *of_splats.shape)
-
-
-def _of_view(of_views: Float[Tensor, " B *k"], i: int) -> Float[Tensor, " 1 *k"]:
-    return of_views if len(of_views) == 1 else of_views[i, None]  # the gradient of which would be a copy
-
-
-def _joined(parts: Sequence[Tensor], dim: int) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat([*parts], dim=dim)
+def _joined(parts: Sequence[Float[Tensor, "height width _"]]) -> Float[Tensor, "height width C"]:
+    return parts[0] if len(parts) == 1 else torch.cat([*parts], dim=-1)
 
 
 @torch.no_grad()
 def _extents(
-    means2d: Float[Tensor, "B N 2"],
-    conics: Float[Tensor, "B N 3"],
-    radii: Int[Tensor, "B N ..."],
+    means2d: Float[Tensor, "1 N 2"],
+    conics: Float[Tensor, "1 N 3"],
+    radii: Int[Tensor, "1 N ..."],
     opacities: Float[Tensor, " N"],
     width: int,
     height: int,
-) -> tuple[Float[Tensor, "B N ..."], Int[Tensor, "B N"]]:
+) -> tuple[Float[Tensor, "1 N ..."], Int[Tensor, "1 N"]]:
     """Radii to bin Gaussians by, as many as gsplat has for each, and sizes, see :class:`Renders`; 0 if not visible.
 
     A splat is binned to all tiles where its alpha counts: farther out than gsplat does, to avoid visible tile borders;
@@ -150,7 +138,7 @@ def _extents(
     return tile_radii.view_as(radii), sizes[..., 0].int()
 
 
-def _floats(radii: Int[Tensor, "B N ..."]) -> Float[Tensor, "B N r"]:
+def _floats(radii: Int[Tensor, "1 N ..."]) -> Float[Tensor, "1 N r"]:
     return (radii[..., None] if radii.dim() == 2 else radii).float()
 
 
@@ -188,8 +176,8 @@ def _tile_radii(reach: Vector, visible: Value, radii: Vector) -> list[Value]:
 
 
 def _probed(
-    means2d: Float[Tensor, "B N 2"], features: Float[Tensor, "N C"], n_densifying: int | None
-) -> tuple[Float[Tensor, "B N 2"], list[tuple[Float[Tensor, "B N 2"], Float[Tensor, "N c"]]]]:
+    means2d: Float[Tensor, "1 N 2"], features: Float[Tensor, "N C"], n_densifying: int | None
+) -> tuple[Float[Tensor, "1 N 2"], list[tuple[Float[Tensor, "1 N 2"], Float[Tensor, "N c"]]]]:
     """Means2d whose gradient drives densification, and groups of features with the means2d they are composited at.
 
     The kernels separate the gradients of features only if these are composited separately; alpha is the last group's.
@@ -215,7 +203,7 @@ class _Tapped(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _Discs:
-    """Discs on the screens of B cameras.
+    """Discs on the screen of a camera, with a dimension for it, as gsplat's kernels take them.
 
     Attributes:
         means2d: projected centres in pixels.
@@ -224,26 +212,22 @@ class _Discs:
             a steep disc is treated as facing the camera.
         radii: see :class:`Renders`.
         tile_radii: half sides of the boxes, or squares, around the means2d outside of which alpha does not count.
-        opacities: the same for all cameras.
+        opacities: of each disc.
     """
 
-    means2d: Float[Tensor, "B N 2"]
-    ray_transforms: Float[Tensor, "B N 9"]
-    inverse_planes: Float[Tensor, "B N 3"]
-    radii: Int[Tensor, "B N"]
-    tile_radii: Float[Tensor, "B N ..."]
+    means2d: Float[Tensor, "1 N 2"]
+    ray_transforms: Float[Tensor, "1 N 9"]
+    inverse_planes: Float[Tensor, "1 N 3"]
+    radii: Int[Tensor, "1 N"]
+    tile_radii: Float[Tensor, "1 N ..."]
     opacities: Float[Tensor, "1 N"]
 
     @property
-    def depths(self) -> Float[Tensor, "B N"]:
+    def depths(self) -> Float[Tensor, "1 N"]:
         """Depths of the centres."""
         return self.ray_transforms[..., 8]
 
-    def of_view(self, i: int) -> _Discs:
-        """Those of one camera, whose number stays a dimension."""
-        return _Discs(*(_of_view(each, i) for each in vars(self).values()))
-
-    def moved(self, means2d: Float[Tensor, "B N 2"]) -> _Discs:
+    def moved(self, means2d: Float[Tensor, "1 N 2"]) -> _Discs:
         """The same with the centres, the last column, recomputed from means2d and depths."""
         return replace(self, means2d=means2d, ray_transforms=elementwise(_recentred, self.ray_transforms, means2d)[0])
 
@@ -253,8 +237,9 @@ def _recentred(transform: Vector, mean2d: Vector) -> list[Vector]:
     return [[t[0], t[1], mean2d[0] * depth, t[3], t[4], mean2d[1] * depth, t[6], t[7], depth]]
 
 
-def _project_discs(splats: Ellipsoids, cameras: Sequence[Camera]) -> _Discs:
-    (means, quats, scales, opacities), (viewmats, Ks, width, height) = splats, _stack(cameras)
+def _project_discs(splats: Ellipsoids, camera: Camera) -> _Discs:
+    (means, quats, scales, opacities), (width, height) = splats, (camera.width, camera.height)
+    viewmats, Ks = camera.viewmat[None], camera.K[None]
     found = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
     radii, _, _, ray_transforms, normals = found  # pyright: ignore[reportAssignmentType]
     sides = _floats(radii)
@@ -332,27 +317,26 @@ def _reach(row: Vector, centre: Value, w: Vector, cutoff: Value, size: Vector) -
 
 def _composite_discs(
     discs: _Discs, bins: tuple[Tensor, Tensor], features: Float[Tensor, "N C"], camera: Camera
-) -> Float[Tensor, "1 height width C"]:
-    """Features of one camera."""
+) -> Float[Tensor, "height width C"]:
+    """Features alone."""
     (channels,) = elementwise(_padded(1 << features.shape[1].bit_length()), features)
     return _run_discs(discs, bins, channels[None], camera)[0][..., : features.shape[1]]
 
 
 def _composite_with_maps(
     discs: _Discs, bins: tuple[Tensor, Tensor], features: Float[Tensor, "N C"], camera: Camera
-) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """Features, alpha, and the maps of one camera, see :class:`Renders`."""
+) -> tuple[Tensor, ...]:
+    """Features, alpha, and the maps, see :class:`Renders`."""
     n_features = features.shape[1]
     # A power of two: gsplat would pad with uninitialised memory. The kernel returns the last feature of the median disc
     # as its depth: the disc's number here, to look it up.
     size = 1 << (n_features + 6).bit_length()
     (channels,) = elementwise(_with_products(size), features, discs.inverse_planes, _numbers(features))
-    composited, alpha, inverse_plane, median = (each.squeeze(0) for each in _run_discs(discs, bins, channels, camera))
+    composited, alpha, inverse_plane, median = _run_discs(discs, bins, channels, camera)
     rays = camera.rays()
     rendered, inverse_depth, square = elementwise(_maps(n_features), composited, inverse_plane, rays)
     (median_depth,) = elementwise(_median, embedding(_numbered(median[..., 0]), discs.inverse_planes[0]), rays, alpha)
-    rendered, alpha, *maps = (each[None] for each in (rendered, alpha, inverse_depth, square, median_depth))
-    return rendered, alpha, tuple(maps)
+    return rendered, alpha, inverse_depth, square, median_depth
 
 
 _BITS_OF_TWO = 1 << 30
@@ -372,13 +356,13 @@ def _numbered(medians: Float[Tensor, "height width"]) -> Int[Tensor, "height wid
 def _run_discs(
     discs: _Discs, bins: tuple[Tensor, Tensor], channels: Float[Tensor, "1 N c"], camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Composited channels, alpha and inverse planes, and the last channel of the median disc."""
+    """Composited channels, alpha and inverse planes of an image, and the last channel of the median disc."""
     transforms = discs.ray_transforms.unflatten(-1, (3, 3))
     renders = rasterize_to_pixels_2dgs(
         *(discs.means2d, transforms, channels, discs.opacities, discs.inverse_planes),
         *(torch.zeros_like(discs.means2d), camera.width, camera.height, TILE, *bins),
     )
-    composited, alpha, inverse_plane, _, median = renders  # pyright: ignore[reportAssignmentType]
+    composited, alpha, inverse_plane, _, median = (each.squeeze(0) for each in renders)  # pyright: ignore
     return composited, alpha, inverse_plane, median
 
 
@@ -429,22 +413,13 @@ def _median(inverse_plane: Vector, ray: Vector, alpha: Vector) -> list[Vector]:
 
 @torch.no_grad()
 def _bin(
-    means2d: Float[Tensor, "B N 2"],
-    radii: Float[Tensor, "B N ..."],
-    depths: Float[Tensor, "B N"],
+    means2d: Float[Tensor, "1 N 2"],
+    radii: Float[Tensor, "1 N ..."],
+    depths: Float[Tensor, "1 N"],
     width: int,
     height: int,
-) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, " entries"]]:
+) -> tuple[Int[Tensor, "1 rows columns"], Int[Tensor, " entries"]]:
     """Bin splats to tiles, front to back: offset of each tile in the list of splats, and the list."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     _, tiles, splats = isect_tiles(means2d, radii.int(), depths, TILE, columns, rows)
     return isect_offset_encode(tiles, len(means2d), columns, rows), splats
-
-
-def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"], int, int]:
-    """Viewmats, Ks, and the common width and height."""
-    viewmats, Ks = (
-        _joined([each[None] for each in matrices], dim=0)
-        for matrices in zip(*((camera.viewmat, camera.K) for camera in cameras), strict=True)
-    )
-    return viewmats, Ks, cameras[0].width, cameras[0].height

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,10 +22,10 @@ ALPHA_MAX = 0.999
 
 @dataclass(frozen=True)
 class Projection:
-    """Splats on the screens of B cameras.
+    """Splats on the screen of a camera.
 
     Attributes:
-        means2d: centres in pixels.
+        means2d: centres in pixels, with a dimension for the camera, as gsplat's strategies take them.
         shapes: shape parameters of the primitive's kernels.
         depths: z of the centres in the camera frame.
         outlines: O ellipses (see :mod:`~.binning`) that together cover the pixels where alpha reaches 1/255.
@@ -37,46 +35,29 @@ class Projection:
         probed: centres, and the shape parameters that depend on them, computed from the probe.
     """
 
-    means2d: Float[Tensor, "B N 2"]
-    shapes: Float[Tensor, "B N K"]
-    depths: Float[Tensor, "B N"]
-    outlines: Float[Tensor, "B N O 7"]
-    covars2d: Float[Tensor, "B N 3"]
-    visible: Bool[Tensor, "B N"]
-    probe: Float[Tensor, "B N 2"] | None = None
-    probed: Float[Tensor, "B N 2+k"] | None = None
-
-    def views(self) -> Iterator[View]:
-        """Iterate over the cameras."""
-        parts = (self.means2d, self.shapes, self.depths, self.outlines, self.visible)
-        # The gradient of unbind is a stack; that of indexing would fill a whole batch for each view.
-        probed = [None] * len(self.means2d) if self.probed is None else self.probed.unbind(0)
-        return (View(*view) for view in zip(*(part.unbind(0) for part in parts), probed, strict=True))
-
-
-class View(NamedTuple):
-    """Splats on the screen of one camera, see :class:`Projection`."""
-
-    means2d: Float[Tensor, "N 2"]
+    means2d: Float[Tensor, "1 N 2"]
     shapes: Float[Tensor, "N K"]
     depths: Float[Tensor, " N"]
     outlines: Float[Tensor, "N O 7"]
+    covars2d: Float[Tensor, "N 3"]
     visible: Bool[Tensor, " N"]
-    probed: Float[Tensor, "N 2+k"] | None
+    probe: Float[Tensor, "1 N 2"] | None = None
+    probed: Float[Tensor, "N 2+k"] | None = None
 
 
-def project_gaussians(splats: Ellipsoids, cameras: Sequence[Camera], with_probe: bool = False) -> Projection:
+def project_gaussians(splats: Ellipsoids, camera: Camera, with_probe: bool = False) -> Projection:
     """Project Gaussians (EWA splatting, Zwicker et al. 2001); means2d and shapes are differentiable.
 
     The shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none depends on the
     screen position of the centre.
     """
-    means2d, shapes, depths, outlines, covars2d, visible = elementwise(
-        _project, *splats[:3], splats.opacities[:, None], *stack_cameras(cameras)
-    )
-    probe = means2d.detach().requires_grad_() if with_probe else None
-    outlines, visible = outlines[..., None, :], visible[..., 0] > 0
-    return Projection(means2d, shapes, depths[..., 0], outlines, covars2d, visible, probe=probe, probed=probe)
+    means2d, *others = elementwise(_project, *splats[:3], splats.opacities[:, None], *parameters_of(camera))
+    shapes, depths, outlines, covars2d, visible = (each.squeeze(0) for each in others)
+    projection = Projection(means2d, shapes, depths[:, 0], outlines[:, None], covars2d, visible[:, 0] > 0)
+    if not with_probe:
+        return projection
+    probe = means2d.detach().requires_grad_()
+    return replace(projection, probe=probe, probed=probe.squeeze(0))
 
 
 def _project(
@@ -117,7 +98,7 @@ def _project(
     return [means2d, shape, [depth], outline, [xx, xy, yy], [torch.where(visible, 1.0, 0.0)]]
 
 
-def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Int[Tensor, "B N"]:
+def three_sigmas(covars2d: Float[Tensor, "N 3"], visible: Bool[Tensor, " N"]) -> Int[Tensor, " N"]:
     """Radii of splats, see :class:`~.renders.Renders`, from their covariances (xx, xy, yy) in px²."""
     return three_sigma(covars2d.unbind(-1), visible).int()
 
@@ -130,14 +111,11 @@ def three_sigma(covar2d: Vector, visible: Value) -> Value:
     return torch.where(visible, torch.ceil(3 * torch.sqrt(variance)), 0.0)
 
 
-def stack_cameras(
-    cameras: Sequence[Camera],
-) -> tuple[Float[Tensor, "B 1 16"], Float[Tensor, "B 1 4"], Float[Tensor, "2"]]:
-    """Viewmats, intrinsics, and the common width and height."""
-    Ks = torch.stack([camera.K for camera in cameras])
-    intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)
-    size = Ks.new_tensor([cameras[0].width, cameras[0].height])
-    return torch.stack([camera.viewmat for camera in cameras]).flatten(1)[:, None], intrinsics[:, None], size
+def parameters_of(camera: Camera) -> tuple[Float[Tensor, "1 1 16"], Float[Tensor, "1 1 4"], Float[Tensor, "2"]]:
+    """Viewmat, intrinsics, and width and height of a camera, for the functions of splats here."""
+    K = camera.K
+    intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    return camera.viewmat.flatten()[None, None], intrinsics[None, None], K.new_tensor([camera.width, camera.height])
 
 
 # Vectors are lists of their coordinates, and matrices of their rows' values, one row after another.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from shellgs_method.render.rasterizer.disc_kernels import DISCS
 from shellgs_method.render.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.render.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.render.rasterizer.kernels import Kernels
-from shellgs_method.render.rasterizer.projection import Projection, View, project_gaussians, three_sigmas
+from shellgs_method.render.rasterizer.projection import Projection, project_gaussians, three_sigmas
 from shellgs_method.render.rasterizer.renders import Ellipsoids, Renders
 
 
@@ -28,11 +28,11 @@ def rasterize(
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, " N"],
     features: Float[Tensor, "N C"],
-    camera: Camera | Sequence[Camera],
+    camera: Camera,
     primitive: Literal["3d", "2d"] = "3d",
     backend: gsplat_backend.Backend = "auto",
     n_densifying: int | None = None,
-) -> tuple[Float[Tensor, "*B height width C"], Float[Tensor, "*B height width 1"], dict[str, Any]]:
+) -> tuple[Float[Tensor, "height width C"], Float[Tensor, "height width 1"], dict[str, Any]]:
     """Composite the features of 3D Gaussians or 2D discs front to back, sorted by the depth of their centres.
 
     Gaussians are projected by the EWA approximation. Discs, spanned by the first two axes of a splat, are intersected
@@ -47,7 +47,7 @@ def rasterize(
         scales: standard deviations along the rotated axes, in scene units, positive.
         opacities: opacities in (0, 1).
         features: any channels, all composited in one pass.
-        camera: one camera, or B of one size; moved to the dtype and device of the means.
+        camera: moved to the dtype and device of the means.
         primitive: "3d" for Gaussians, "2d" for discs.
         backend: ``torch`` runs everywhere; ``gsplat`` takes float32 tensors on a CUDA device where its kernels load;
             ``auto`` is gsplat where it runs.
@@ -56,11 +56,10 @@ def rasterize(
 
     Returns:
         Sums of weight times feature (not divided by alpha, no background), sums of the weights, and the ``info`` of
-        gsplat's densification strategies: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained, ``radii``
-        [B, N] as in :class:`Renders` with every backend (those of gsplat 1.5 take ``radii[..., None]``), …. The renders
-        of a sequence of cameras are stacked.
+        gsplat's densification strategies: ``means2d`` [1, N, 2] in pixels, whose gradient can be retained, ``radii``
+        [1, N] as in :class:`Renders` with every backend (those of gsplat 1.5 take ``radii[..., None]``), ….
 
-        For discs, ``info`` also has differentiable maps ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z
+        For discs, ``info`` also has differentiable maps ``[H, W, 1]``: ``inverse_depth``, the sum of weight over z
         of the ray's intersection, so that alpha / inverse_depth is the expected depth (1/z is averaged because it is
         affine on the screen: every backend can composite it exactly); ``median_depth``, the z of the splat at which
         the transmittance falls to 1/2 or less, 0 where it does not, with a gradient to that splat alone; and
@@ -69,30 +68,22 @@ def rasterize(
         low-pass is added.
 
     Raises:
-        ValueError: If there are no cameras, they differ in size, or ``backend`` is ``gsplat`` and it cannot run.
+        ValueError: If ``backend`` is ``gsplat`` and it cannot run.
     """
-    cameras = [camera] if isinstance(camera, Camera) else list(camera)
-    sizes = {(each.width, each.height) for each in cameras}
-    if len(sizes) != 1:
-        raise ValueError(f"The cameras of a batch need one size in common, not {sorted(sizes)}.")
-    ((width, height),) = sizes
-    cameras = [each.to(means) for each in cameras]
     on_gsplat = gsplat_backend.runs_on_gsplat(backend, means)
     render = (gsplat_backend.RASTERIZE if on_gsplat else _RASTERIZE)[primitive]
-    renders = render(Ellipsoids(means, quats, scales, opacities), features, cameras, n_densifying)
+    renders = render(Ellipsoids(means, quats, scales, opacities), features, camera.to(means), n_densifying)
     info = {
         "means2d": renders.means2d,
         "radii": renders.radii,
         "gaussian_ids": None,
-        "width": width,
-        "height": height,
-        "n_cameras": len(cameras),
+        "width": camera.width,
+        "height": camera.height,
+        "n_cameras": 1,
     }
-    rendered = renders.composited, renders.alpha, *renders.maps
-    composited, alpha, *maps = (each.squeeze(0) for each in rendered) if isinstance(camera, Camera) else rendered
     if primitive == "2d":
-        info |= {"gradient_2dgs": renders.means2d, **disc_maps(alpha, *maps)}
-    return composited, alpha, info
+        info |= {"gradient_2dgs": renders.means2d, **disc_maps(renders.alpha, *renders.maps)}
+    return renders.composited, renders.alpha, info
 
 
 def _rasterize(
@@ -100,14 +91,20 @@ def _rasterize(
     kernels: Kernels,
     splats: Ellipsoids,
     features: Float[Tensor, "N C"],
-    cameras: Sequence[Camera],
+    camera: Camera,
     n_densifying: int | None,
 ) -> Renders:
     """Rasterize in torch the primitive given by ``project`` and ``kernels``."""
-    projection = project(splats, cameras, with_probe=n_densifying is not None)
-    views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
-    composited, alpha, *maps = torch.stack(views).split([features.shape[1], 1, *[1] * kernels.n_maps], dim=-1)
-    radii = three_sigmas(projection.covars2d, projection.visible)
+    projection = project(splats, camera, with_probe=n_densifying is not None)
+    visible = projection.visible.nonzero().squeeze(1)
+    depths = projection.depths.index_select(0, visible)
+    # The bits of positive floats are integers of the same order, which sort several times faster.
+    depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
+    order = visible.index_select(0, stable_order(depths))
+    bins = bin_splats(projection.outlines.index_select(0, order), camera.width, camera.height)
+    canvas = composite(projection, features, order, bins, kernels, n_densifying or 0)
+    composited, alpha, *maps = canvas.split([features.shape[1], 1, *[1] * kernels.n_maps], dim=-1)
+    radii = three_sigmas(projection.covars2d, projection.visible)[None]
     centres = projection.means2d if projection.probe is None else projection.probe
     return Renders(composited, alpha, tuple(maps), centres, radii)
 
@@ -116,16 +113,3 @@ _RASTERIZE = {
     "3d": partial(_rasterize, project_gaussians, GAUSSIANS),
     "2d": partial(_rasterize, project_discs, DISCS),
 }
-
-
-def _render(
-    view: View, kernels: Kernels, features: Float[Tensor, "N C"], camera: Camera, n_densifying: int
-) -> Float[Tensor, "height width C+1+maps"]:
-    """Features, alpha and the primitive's maps of one camera."""
-    visible = view.visible.nonzero().squeeze(1)
-    depths = view.depths.index_select(0, visible)
-    # The bits of positive floats are integers of the same order, which sort several times faster.
-    depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
-    order = visible.index_select(0, stable_order(depths))
-    bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
-    return composite(view, features, order, bins, kernels, n_densifying)

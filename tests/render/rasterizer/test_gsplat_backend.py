@@ -65,12 +65,12 @@ def steep_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
 )
 @pytest.mark.parametrize("n_densifying", [None, 3])
 def test_gsplat_gives_the_render_and_gradients_of_the_torch_backend(primitive, make, names, n_densifying):
-    cameras = orbit(make_camera(45, 37), 2)
+    camera = orbit(make_camera(45, 37), 2)[1]
     splats = [splat.requires_grad_() for splat in make(80, 5, seed=2)]
     results = []
     for backend in ("torch", "gsplat"):
         composited, alpha, info = rasterize(
-            *splats, camera=cameras, primitive=primitive, backend=backend, n_densifying=n_densifying
+            *splats, camera=camera, primitive=primitive, backend=backend, n_densifying=n_densifying
         )
         maps = [composited, alpha, *(info[name] for name in names)]
         results.append([*maps, *gradients(splats, maps, info["means2d"])])
@@ -81,10 +81,10 @@ def test_gsplat_gives_the_render_and_gradients_of_the_torch_backend(primitive, m
 @pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs), ("2d", steep_discs)])
 def test_gsplat_densifies_by_the_radii_of_the_torch_backend(primitive, make):
     """Of the same splats, but for some whose box, rounded up, touches the image, or that gsplat 1.4 culls."""
-    splats, cameras = make(400, 1, seed=5), orbit(make_camera(31, 23), 2)
+    splats, camera = make(400, 1, seed=5), make_camera(31, 23)
     splats[0] = splats[0] * torch.tensor([3.0, 3.0, 1.0])  # many beside the images
     torch_radii, gsplat_radii = (
-        rasterize(*splats, camera=cameras, primitive=primitive, backend=backend)[2]["radii"]
+        rasterize(*splats, camera=camera, primitive=primitive, backend=backend)[2]["radii"]
         for backend in ("torch", "gsplat")
     )
     seen, kept = torch_radii > 0, gsplat_radii > 0
