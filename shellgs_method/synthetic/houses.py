@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.bounds import Bounds, FromOne, Pixels, Seed, check_bounds
+from shellgs_method.bounds import Bounds, FromOne
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import affine, transformed
 from shellgs_method.synthetic.appearance import Daylight, log_gains, noise_lattice
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.geometry import Material, Mesh, merge, moved, parallelogram
 from shellgs_method.synthetic.path import walk
-from shellgs_method.synthetic.site import Site, generators
+from shellgs_method.synthetic.site import Site, SiteConfig, generators
 from shellgs_method.synthetic.street import pole_and_tree
 from shellgs_method.synthetic.world import Place, World
 
@@ -33,27 +33,13 @@ _NUMBERS = 20  # between the first bays of two houses
 
 
 @dataclass(frozen=True)
-class StreetConfig:
+class StreetConfig(SiteConfig):
     """A procedural street, a walk past either side of it in light that changes, and a scan that lacks one house."""
 
-    width: Pixels = 320
-    """Image width in pixels."""
-    height: Pixels = 180
-    """Image height in pixels."""
     views: Annotated[int, Bounds(6, 1e6, int)] = 160
-    """Number of photographs."""
-    seed: Seed = 0
-    """Seed of houses, trees, textures, walk, light and noise; the same seed gives the same files."""
+    points: FromOne = 16000
     houses: Annotated[int, Bounds(2, 1e3, int)] = 4
     """Number of houses in the scan; one more, the second of the far side, is missing from it."""
-    points: FromOne = 16000
-    """Maximum number of SfM points."""
-    supersampling: FromOne = 3
-    """Rays per pixel along each image axis."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that no scene can be made with."""
-        check_bounds(type(self), vars(self))
 
 
 @dataclass(frozen=True)

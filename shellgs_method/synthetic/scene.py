@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.bounds import FromOne, Pixels, Seed, Views, check_bounds
+from shellgs_method.bounds import FromOne
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, unfinished
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -36,7 +36,7 @@ from shellgs_method.synthetic.houses import Street, StreetConfig
 from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, observations, triangulate
-from shellgs_method.synthetic.site import Site, generators
+from shellgs_method.synthetic.site import Site, SiteConfig, generators
 from shellgs_method.synthetic.street import court, street
 from shellgs_method.synthetic.world import World
 
@@ -46,31 +46,15 @@ PREDICTIONS = "predictions"  # simulated disparity of a monocular network
 
 
 @dataclass(frozen=True)
-class FacadeConfig:
+class FacadeConfig(SiteConfig):
     """A procedural facade and a walk past it."""
 
-    width: Pixels = 320
-    """Image width in pixels."""
-    height: Pixels = 180
-    """Image height in pixels."""
-    views: Views = 40
-    """Number of photographs."""
-    seed: Seed = 0
-    """Seed of the tree, the textures, the walk and the noise; the same seed gives the same files."""
     bays: FromOne = 6
     """Windows side by side, 3 m apart."""
     storeys: FromOne = 3
     """Windows above each other, 3.3 m apart."""
-    points: FromOne = 4000
-    """Maximum number of SfM points."""
-    supersampling: FromOne = 3
-    """Rays per pixel along each image axis."""
     surroundings: Literal["street", "court"] = "street"
     """What is around the building: a street below the sky, or a court without sky."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that no scene can be made with."""
-        check_bounds(type(self), vars(self))
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,34 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from shellgs_method.bounds import FromOne, Pixels, Seed, Views, check_bounds
 from shellgs_method.files.map_files import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.synthetic.appearance import Daylight, rays
 from shellgs_method.synthetic.frames import UNITS_PER_METRE
 from shellgs_method.synthetic.geometry import Material, Mesh
+
+
+@dataclass(frozen=True)
+class SiteConfig:
+    """Settings of a site, and of the photographs that are taken of it."""
+
+    width: Pixels = 320
+    """Image width in pixels."""
+    height: Pixels = 180
+    """Image height in pixels."""
+    views: Views = 40
+    """Number of photographs."""
+    seed: Seed = 0
+    """Seed of buildings, trees, textures, walk, light and noise; the same seed gives the same files."""
+    points: FromOne = 4000
+    """Maximum number of SfM points."""
+    supersampling: FromOne = 3
+    """Rays per pixel along each image axis."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that no scene can be made with."""
+        check_bounds(type(self), vars(self))
 
 
 @dataclass(frozen=True)
