@@ -121,7 +121,7 @@ def _has_few(photograph: Path) -> bool:
 
 
 def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
-    """Photographs without copies of another's file; these are reported, and so are two formats of one name.
+    """Photographs without copies of another's file; these are reported.
 
     A view would be trained on whose copy is held out.
     """
@@ -134,14 +134,7 @@ def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
             f"({copy.relative_to(folder)} is {original.relative_to(folder)}, for example)."
         )
     kept = [path for path in photographs if path not in copies]
-    stems = Counter(path.with_suffix("") for path in kept)
-    if twins := [path.name for path in kept if stems[path.with_suffix("")] > 1]:
-        notice(
-            f"{len(twins)} photographs of {folder} have the name of another with another suffix ({twins[0]} and "
-            f"{twins[1]}, for example): if they are one photograph in two formats, remove one of the two, or metrics "
-            "of held-out photographs will be too good."
-        )
-    _tell_of_versions(folder, [path for path in kept if stems[path.with_suffix("")] == 1])
+    _tell_of_versions(folder, kept)
     return kept
 
 

@@ -150,15 +150,16 @@ def test_a_walk_along_a_plain_wall_between_sky_and_ground_shows_no_copies(tmp_pa
     assert not caplog.text
 
 
-def test_photographs_that_were_encoded_again_are_told(tmp_path, caplog):
+@pytest.mark.parametrize("copy", ["sent.jpg", "IMG_1.png"])
+def test_photographs_that_were_encoded_again_are_told(tmp_path, caplog, copy):
     for k in range(3):
         photograph(64, 48, seed=k).resize((640, 480)).save(tmp_path / f"IMG_{k}.jpg")
     tell_of_near_copies(tmp_path, ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"])
     assert not caplog.text
     with Image.open(tmp_path / "IMG_1.jpg") as image:
-        image.resize((320, 240)).save(tmp_path / "sent.jpg", quality=50)
-    tell_of_near_copies(tmp_path, ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "sent.jpg"])
-    assert "1 of 4 photographs show the same as others (sent.jpg as IMG_1.jpg, for example)" in caplog.text
+        image.resize((320, 240)).save(tmp_path / copy, quality=50)
+    tell_of_near_copies(tmp_path, ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", copy])
+    assert f"1 of 4 photographs show the same as others ({copy} as IMG_1.jpg, for example)" in caplog.text
 
 
 def test_exposures_of_a_bracket_are_told(tmp_path, caplog):
@@ -183,14 +184,6 @@ def test_photographs_of_one_moment_are_told(tmp_path, caplog, fraction, told):
     assert len(find_photographs(tmp_path)) == 3
     assert ("1 photographs of" in caplog.text) == told
     assert ("(IMG_E0001.jpg at that of IMG_0001.jpg, for example)" in caplog.text) == told
-
-
-def test_two_formats_of_one_name_are_kept_and_told(tmp_path, caplog):
-    for k, name in enumerate(("IMG_1.jpg", "IMG_1.PNG", "IMG_2.jpg")):
-        photograph(seed=k).save(tmp_path / name)
-    assert len(find_photographs(tmp_path)) == 3
-    assert "2 photographs of" in caplog.text
-    assert "if they are one photograph in two formats" in caplog.text
 
 
 def test_photographs_of_a_phone_are_read_in_any_case_of_their_suffix(tmp_path):
