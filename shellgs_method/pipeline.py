@@ -35,7 +35,7 @@ from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
-from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
+from shellgs_method.runs.checkpoints import guard_checkpoint_loading
 from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.host import mend_commands
 from shellgs_method.viewer import ContradictedShell
@@ -140,15 +140,10 @@ class FacadePipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians and exposures.
 
-        Damaged ones, and those of another ``sh_degree`` or ``exposure`` than the settings', end the program with a
-        message.
+        Those of another ``sh_degree`` or ``exposure`` than the settings' end the program with a message.
         """
         trained_on = [*loaded_state.get("_extra_state", {}).get("cameras", {})]
         with refusals_end_the_program():
-            try:
-                check_gaussians(loaded_state)
-            except SceneError as error:
-                raise SceneError(f"the checkpoint cannot be used: {error}") from error
             for name, parameter in self.model.gauss_params.items():
                 stored = loaded_state[f"_model.gauss_params.{name}"]
                 if stored.shape[1:] != parameter.shape[1:]:

@@ -163,10 +163,7 @@ def check_gaussians(state: Mapping[str, Any]) -> None:
     Raises:
         SceneError: says what is wrong.
     """
-    stored: dict[str, Tensor] = {
-        key.rpartition(".")[2]: value for key, value in state.items() if ".gauss_params." in f".{key}"
-    }
-    if not stored:
+    if not (stored := gaussians_in(state)):
         return
     if lacking := [name for name in _GAUSSIANS if not isinstance(stored.get(name), Tensor)]:
         raise SceneError(f"its Gaussians have no {' and no '.join(lacking)}")
