@@ -37,13 +37,12 @@ class Bounds(NamedTuple):
 
 
 COUNT, FROM_ONE = Bounds(0, 1e9, int), Bounds(1, 1e9, int)
-WEIGHT, SHARE, LENGTH, RATE = Bounds(0, 1e6), Bounds(0, 1), Bounds(TINY, 1e6), Bounds(TINY, 1e3)
+WEIGHT, LENGTH, RATE = Bounds(0, 1e6), Bounds(TINY, 1e6), Bounds(TINY, 1e3)
 PORT, SEED, JOBS = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int), Bounds(1, 1024, int)
 
 Count = Annotated[int, COUNT]
 FromOne = Annotated[int, FROM_ONE]
 Weight = Annotated[float, WEIGHT]
-Share = Annotated[float, SHARE]
 Length = Annotated[float, LENGTH]
 Rate = Annotated[float, RATE]
 Pixels = Annotated[int, Bounds(16, 32768, int)]

@@ -120,8 +120,8 @@ def check_scene(config: TrainerConfig, pipeline: Pipeline) -> None:
     Raises:
         SceneError: the run's world is not that of the scene.
     """
-    folder, parsed = config.get_base_dir(), _parsed(pipeline)
-    if parsed is not None:
+    folder, parsed = config.get_base_dir(), getattr(pipeline.datamanager, "train_dataparser_outputs", None)
+    if isinstance(parsed, DataparserOutputs):  # a method may have no dataparser
         check_world(folder, parsed, f"`data` in {folder / 'config.yml'}, or train again")
 
 
@@ -241,12 +241,6 @@ def _candidates(path: Path, written: Path, folder: Path) -> Iterator[Path]:
         candidate = above / (path.name if path.is_absolute() else path)
         if not folder.is_relative_to(candidate):  # the folder of all runs of a scene has its name
             yield candidate
-
-
-def _parsed(pipeline: Pipeline) -> DataparserOutputs | None:
-    """What the pipeline's dataparser read, where it has one."""
-    parsed = getattr(pipeline.datamanager, "train_dataparser_outputs", None)
-    return parsed if isinstance(parsed, DataparserOutputs) else None
 
 
 def _get_base_dir(self: ExperimentConfig) -> Path:
