@@ -14,7 +14,7 @@ from rich.markup import escape
 
 EVERY = 2.0
 """Seconds between two lines about the same work."""
-_LINE = re.compile(r"([A-Z][^:]*)(?:: (\d+) of (\d+)(.*)| \.\.\.)")
+_LINE = re.compile(r"([A-Z][^:]*)(?:: (\d+) of (\d+)| \.\.\.)")
 _NERFSTUDIO = re.compile(r"(\d+) \([\d.]+%\)")  # its table of iterations
 
 ItemT = TypeVar("ItemT")
@@ -28,7 +28,6 @@ class Stage(NamedTuple):
     what: str
     item: int | None = None
     total: int | None = None
-    note: str = ""
 
     @classmethod
     def read(cls, line: str) -> Stage | None:
@@ -36,12 +35,12 @@ class Stage(NamedTuple):
         if match := _NERFSTUDIO.match(line):
             return cls(ITERATION, int(match[1]) + 2)  # printed when that one, counted from 0, has ended
         if match := _LINE.fullmatch(line.rstrip()):
-            what, item, total, note = match.groups()
-            return cls(what, int(item), int(total), note) if item else cls(what)
+            what, item, total = match.groups()
+            return cls(what, int(item), int(total)) if item else cls(what)
         return None
 
     def __str__(self) -> str:
-        count = "" if self.item is None else f" {self.item}" + (f" of {self.total}{self.note}" if self.total else "")
+        count = "" if self.item is None else f" {self.item}" + (f" of {self.total}" if self.total else "")
         return self.what[0].lower() + self.what[1:] + count
 
 

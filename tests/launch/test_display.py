@@ -52,14 +52,14 @@ def test_a_log_tells_each_stage_at_once_and_one_that_counts_every_ten_seconds_an
     for second in range(3600):
         clock.now = float(second)
         if second == 15:
-            work.tell(Stage("Compiling kernels", 1, 23, " (once for all runs)"))
+            work.tell(Stage("Reading the shell's maps", 1, 23))
         if second >= 40:
             work.tell(Stage(ITERATION, second - 39, 10_000))
         if sentence := work.for_log():
             told.append((second, sentence))
     times = [when for when, _ in told]
     assert times[:5] == [0, 15, 25, 35, 40]
-    assert told[1][1] == "scene/shellgs/seed-0: compiling kernels 1 of 23 (once for all runs) (0:15)"
+    assert told[1][1] == "scene/shellgs/seed-0: reading the shell's maps 1 of 23 (0:15)"
     assert max(b - a for a, b in pairwise(times)) == 60
     assert len(times) < 120
 
@@ -85,7 +85,7 @@ def test_a_command_is_shown_with_the_stages_that_it_prints(tmp_path, monkeypatch
     monkeypatch.setattr(local, "BIN", tmp_path)
     (tmp_path / "ns-train").write_text(
         "import time\n"
-        "for line in ('Reading the scene ...', 'Compiling kernels: 7 of 23 (once for all runs)',\n"
+        "for line in ('Reading the scene ...', 'Compiling kernel 7, once for all runs ...',\n"
         "             'Iteration: 220 of 750', '10 (1.33%)   2 s', 'Evaluating view: 3 of 8', 'that is all'):\n"
         "    print(line)\n"
         "    time.sleep(0.4)\n"
@@ -96,7 +96,7 @@ def test_a_command_is_shown_with_the_stages_that_it_prints(tmp_path, monkeypatch
         follow([["ns-train"]], tell=tell)
     stages = [
         "reading the scene (0:0",
-        "compiling kernels 7 of 23 (once for all runs) (0:0",
+        "compiling kernel 7, once for all runs (0:0",
         "iteration 220 of 750 (0:0",
         "evaluating view 3 of 8 (0:0",
     ]

@@ -54,7 +54,7 @@ def test_what_is_printed_is_read_as_a_stage(clock, capsys):
 @pytest.mark.parametrize(
     ("line", "stage"),
     [
-        ("Compiling kernels: 7 of 23 (once for all runs)", "compiling kernels 7 of 23 (once for all runs)"),
+        ("Compiling kernel 7, once for all runs ...", "compiling kernel 7, once for all runs"),
         ("10 (1.33%)          286.086 ms           3 m, 28 s            342.11 K              \x1b[0m", "iteration 12"),
         ("Step (% Done)       Train Iter (time)    ETA (time)", None),
         ("logging events to: runs/scene", None),
