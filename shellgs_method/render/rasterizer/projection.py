@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
@@ -98,13 +98,8 @@ def _project(
     return [means2d, shape, [depth], outline, [xx, xy, yy], [torch.where(visible, 1.0, 0.0)]]
 
 
-def three_sigmas(covars2d: Float[Tensor, "N 3"], visible: Bool[Tensor, " N"]) -> Int[Tensor, " N"]:
-    """Radii of splats, see :class:`~.renders.Renders`, from their covariances (xx, xy, yy) in px²."""
-    return three_sigma(covars2d.unbind(-1), visible).int()
-
-
 def three_sigma(covar2d: Vector, visible: Value) -> Value:
-    """Radius of a splat, a whole number, see :func:`three_sigmas`."""
+    """Radius of a splat, a whole number, see :class:`~.renders.Renders`, from its covariance (xx, xy, yy) in px²."""
     xx, xy, yy = covar2d
     half = (xx - yy) / 2
     variance = (xx + yy) / 2 + torch.sqrt(half * half + xy * xy)

@@ -18,7 +18,7 @@ from shellgs_method.render.rasterizer.disc_kernels import DISCS
 from shellgs_method.render.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.render.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.render.rasterizer.kernels import Kernels
-from shellgs_method.render.rasterizer.projection import Projection, project_gaussians, three_sigmas
+from shellgs_method.render.rasterizer.projection import Projection, project_gaussians, three_sigma
 from shellgs_method.render.rasterizer.renders import Ellipsoids, Renders
 
 
@@ -104,7 +104,7 @@ def _rasterize(
     bins = bin_splats(projection.outlines.index_select(0, order), camera.width, camera.height)
     canvas = composite(projection, features, order, bins, kernels, n_densifying or 0)
     composited, alpha, *maps = canvas.split([features.shape[1], 1, *[1] * kernels.n_maps], dim=-1)
-    radii = three_sigmas(projection.covars2d, projection.visible)[None]
+    radii = three_sigma(projection.covars2d.unbind(-1), projection.visible).int()[None]
     centres = projection.means2d if projection.probe is None else projection.probe
     return Renders(composited, alpha, tuple(maps), centres, radii)
 
