@@ -19,6 +19,7 @@ from shellgs_method.errors import SceneError, decimal_comma, notice
 from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order, remedy_for
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.readers.contents import encoding_of, with_nan
+from shellgs_method.geometry.similarity import affine
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
 """Folders of numbered models, or of one; it may also be in the scene itself, as RealityScan exports it."""
@@ -290,9 +291,7 @@ def _frame(scene: Path, path: str, image: ColmapImage, cameras: Mapping[int, Col
     quaternion = np.array(image.quaternion)
     if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = image.rotation.T, image.centre
-    return frame(scene, path, pose, _lens(camera, scene), where)
+    return frame(scene, path, affine(image.rotation.T, image.centre), _lens(camera, scene), where)
 
 
 def _lens(camera: ColmapCamera, scene: Path) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import inside
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.lens import COEFFICIENTS, OTHER_COEFFICIENTS, Lens
+from shellgs_method.geometry.similarity import affine
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")  # the same by the name of other programs
@@ -224,9 +225,7 @@ def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:
     if pose.shape != (4, 4) or not turned or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise SceneError(f"{where} has a pose that is not a rotation and translation: {_fault(pose)}")
     u, _, vt = np.linalg.svd(rotation)
-    exact = np.eye(4)
-    exact[:3, :3], exact[:3, 3] = u @ vt, pose[:3, 3]
-    return exact
+    return affine(u @ vt, pose[:3, 3])
 
 
 def _fault(pose: np.ndarray) -> str:

@@ -21,7 +21,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import positions
-from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.geometry.similarity import affine, scale_of, transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.progress import track
 from shellgs_method.registration.geotags import REACH, GeoTags
@@ -238,10 +238,7 @@ class _Search:
                 east, north = self.tags.shift(scale * turn)
                 score[np.hypot.outer(moves[0] - east, moves[1] - north) > _NEAR] = -np.inf
             for index, value in _peaks(score):
-                similarity = np.eye(4)
-                similarity[:3, :3] = scale * turn
-                similarity[:3, 3] = [moves[k][i] for k, i in enumerate(index)]
-                yield Candidate(similarity, value)
+                yield Candidate(affine(scale * turn, [moves[k][i] for k, i in enumerate(index)]), value)
 
 
 def _grid(points: np.ndarray, low: np.ndarray, end: np.ndarray, cell: float) -> np.ndarray:

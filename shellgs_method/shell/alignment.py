@@ -22,7 +22,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.geometry.similarity import affine, scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.loading import load_shell
 from shellgs_method.shell.mesh import ShellMesh
@@ -271,8 +271,7 @@ class Alignment:
         """
         if not path.is_file():
             raise FileNotFoundError(f"the matrix file {path} does not exist")
-        shift = np.eye(4)
-        shift[:3, 3] = global_shift
+        shift = affine(np.eye(3), global_shift)
         try:
             return cls(_read_matrix(path) @ shift, shells, metres_per_shell_unit, source=f"matrix file {path.name}")
         except ValueError as error:
