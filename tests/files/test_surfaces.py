@@ -534,6 +534,16 @@ def test_an_obj_whose_objects_count_their_vertices_from_1_is_read_as_one_that_co
     assert ("count vertices from 1 in each of its 2 objects" in caplog.text) == restarts
 
 
+def test_an_obj_whose_last_object_has_vertices_of_no_face_counts_on(tmp_path, caplog):
+    objects = [
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3",
+        "\n".join(f"v {k} 0 {k * k}" for k in range(9)) + "\nf 4 5 6\nf 7 8 9",
+    ]
+    (tmp_path / "a.obj").write_text("\n".join(objects))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.obj").faces, [[0, 1, 2], [3, 4, 5], [6, 7, 8]])
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("face", ["0 1 2", "-4 -2 -1", "1 2 9"])
 def test_an_obj_with_indices_of_no_vertex_is_refused(tmp_path: Path, face: str):
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {face}\n")

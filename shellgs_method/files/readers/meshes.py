@@ -57,7 +57,8 @@ def read_obj(path: Path) -> Geometry:
     starts = np.concatenate([[0], ends])
     end, start = (np.repeat(some[of], sizes) for some in (ends, starts))
     corners = np.where(stored > 0, stored - 1, stored + end)
-    if len(ends) > 1 and ((stored > 0) & (stored <= end - start)).all():  # the other blocks would be of no face
+    # Counted on, blocks would have vertices of no face, and faces those of other blocks.
+    if ((stored > 0) & (stored <= end - start)).all() and (stored <= start).any():
         notice(f"{path}: its faces count vertices from 1 in each of its {len(ends)} objects, and are read so.")
         corners += start
     if (stored == 0).any() or (corners < 0).any():  # counted from 1, or backwards from the last vertex before the face
