@@ -90,33 +90,33 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
 
 
 def _without_maps(folder: Path, photographs: Sequence[Path]) -> list[Path]:
-    """Photographs without maps of depth, confidence or labels beside them, which are reported.
+    """Photographs without maps of depth, confidence or labels beside those in colour, which are reported.
 
     Apps that scan (Polycam, 3D Scanner App, RTAB-Map) export these with the photographs, in grey: depth with 16 bits,
-    the others with few values.
+    the others with few values. Cameras that take such photographs name themselves in EXIF.
     """
-    modes = {path: _mode(path) for path in photographs}
-    if not _IN_COLOUR & {*modes.values()}:
+    if not any(_is_in_colour(path) for path in photographs):
         return [*photographs]
-    maps = [path for path, mode in modes.items() if mode[:1] in ("I", "F") or (mode in ("1", "L") and _has_few(path))]
+    maps = dict.fromkeys(path for path in photographs if _is_map(path))
     if maps:
         notice(
             f"{len(maps)} files of {folder} are maps of depth, confidence or labels, by their values, and are left "
-            f"out: {maps[0].relative_to(folder)}, for example."
+            f"out: {next(iter(maps)).relative_to(folder)}, for example. If they are photographs, save them with 8 bits."
         )
-    return [path for path in photographs if path not in {*maps}]
+    return [path for path in photographs if path not in maps]
 
 
-def _mode(photograph: Path) -> str:
-    """Pillow's mode of a photograph; empty if it cannot be read, which is reported when it is used."""
+def _is_in_colour(photograph: Path) -> bool:
+    with suppress(Exception), Image.open(photograph) as image:  # one that cannot be read is reported when it is used
+        return image.mode in _IN_COLOUR
+    return False
+
+
+def _is_map(photograph: Path) -> bool:
     with suppress(Exception), Image.open(photograph) as image:
-        return image.mode
-    return ""
-
-
-def _has_few(photograph: Path) -> bool:
-    with suppress(Exception), Image.open(photograph) as image:
-        return image.getcolors(_FEW_VALUES) is not None
+        if image.mode in _IN_COLOUR or ExifTags.Base.Make in image.getexif():
+            return False
+        return image.mode[:1] in ("I", "F") or image.getcolors(_FEW_VALUES) is not None
     return False
 
 

@@ -117,6 +117,15 @@ def test_maps_of_depth_and_confidence_beside_photographs_in_colour_are_left_out_
     assert ("2 files of" in caplog.text and "are maps of depth, confidence or labels" in caplog.text) == in_colour
 
 
+def test_photographs_of_a_camera_in_grey_of_16_bits_are_kept_beside_those_in_colour(tmp_path, caplog):
+    photograph().convert("RGB").save(tmp_path / "a.jpg")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "DJI"
+    Image.fromarray(np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)).save(tmp_path / "b.tif", exif=exif)
+    assert len(find_photographs(tmp_path)) == 2
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("light", [1.0, 0.2])
 def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog, light):
     """As those in nerfstudio's images_2 and images_4; others of the same names are no copies, at night either."""
