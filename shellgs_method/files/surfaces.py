@@ -75,8 +75,8 @@ def read_surface(path: Path) -> Geometry | Cloud:
     read = MESHES.get(suffix)
     if read is None:
         raise SceneError(
-            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: export it, in "
-            f"the coordinates of its region, as one of {', '.join([*MESHES, *CLOUDS])}"
+            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: unpack it, "
+            f"or export it in a local or national system as one of {', '.join([*MESHES, *CLOUDS])}"
         )
     try:
         if suffix == ".ply" and holds_splats(path):

@@ -227,7 +227,7 @@ def test_a_missing_shell_is_refused_with_its_file_name(tmp_path: Path):
 
 def test_a_file_of_an_unknown_format_is_refused(tmp_path: Path):
     (tmp_path / "shell.DXF").write_bytes(b"0")
-    with pytest.raises(SceneError, match=r"shell\.DXF .*: export it, .* as one of \.ply, \.obj"):
+    with pytest.raises(SceneError, match=r"shell\.DXF .*: unpack it, or export it .* as one of \.ply, \.obj"):
         load_shell(tmp_path / "shell.DXF")
 
 

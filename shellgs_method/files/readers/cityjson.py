@@ -31,7 +31,10 @@ def read_cityjson(path: Path) -> Geometry:
     documents = _documents(path.read_text("utf-8-sig"))
     head = documents[0]
     if not isinstance(head, dict) or head.get("type") != "CityJSON":
-        raise SceneError(f"the shell {path} is json, but not CityJSON: export it as CityJSON, CityGML, IFC or a mesh")
+        raise SceneError(
+            f"the shell {path} is json, but not CityJSON: export the building as CityJSON, CityGML, IFC, a mesh or a "
+            "point cloud, in a local or national system"
+        )
     missing: Counter[str] = Counter()
     objects: list[CityObject] = []
     for document in documents:
