@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from threadpoolctl import threadpool_limits
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import Model
@@ -168,6 +169,7 @@ class Adjustment:
         )
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # threads for small matrices wait for each other most of the time
 def adjusted(
     surface: ShellSurface,
     model: Model,
