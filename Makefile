@@ -6,8 +6,9 @@ BIN := .venv/bin
 demo: .venv/checked  ## install; make the synthetic facade, train photo-gs and shellgs-metric on it, compare
 	$(BIN)/shellgs demo
 
-# OpenMP's threads spin while they wait; training adapts to what else runs (threads.py), but these tests are short.
+# Threads of OpenMP and of BLAS spin while they wait; training adapts to what else runs (threads.py), but these tests are short.
 test: export OMP_WAIT_POLICY ?= passive
+test: export OPENBLAS_NUM_THREADS ?= 1
 test: .venv/dev .venv/checked  ## install; format, lint, types, imports, tests
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
