@@ -57,7 +57,7 @@ def turned(axis: str) -> np.ndarray:
     return motion
 
 
-@pytest.mark.parametrize("axis", ["x", "none"])
+@pytest.mark.parametrize("axis", [pytest.param("x", marks=pytest.mark.slow), "none"])
 def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
     motion = turned(axis)
     askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
