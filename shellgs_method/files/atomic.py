@@ -34,11 +34,13 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         with temporary.open("wb") as file:
             yield file
         os.replace(temporary, path)
-    except OSError as error:  # the error of a full disk names no file
-        error.filename = error.filename or str(path)
+    except OSError as error:  # of a full disk, names no file; of a read-only one, the temporary file
+        if str(error.filename) in ("None", str(temporary)):
+            error.filename = str(path)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a read-only disk refuses even to delete what is missing
+            temporary.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

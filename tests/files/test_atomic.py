@@ -1,7 +1,8 @@
-"""Hashes of files, which are kept for large ones."""
+"""Hashes of files, which are kept for large ones, and files that are written as a whole."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -125,3 +126,16 @@ def test_a_file_in_the_place_of_a_folder_is_refused_before_anything_is_replaced(
     with pytest.raises(SceneError, match=r"made/a is in the way"), atomic.atomic_contents(folder) as complete:
         fill(complete, (made, "first"), "new")
     assert (folder / "first").read_text() == "old"
+
+
+def test_a_file_that_cannot_be_written_is_named_by_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not by that of the temporary file, which a read-only disk refuses to open and also to delete."""
+
+    def refuse(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(OSError, match="Read-only") as raised:
+        atomic.write_whole(tmp_path / "manifest.json", "{}")
+    assert raised.value.filename == str(tmp_path / "manifest.json")
