@@ -62,7 +62,10 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
             "written, so a --matrix must map to these."
         )
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
-    bad = _names([each.get("file_path") for each in listed_frames if _is_bad(each)], files, path)
+    marked = [each.get("file_path") for each in listed_frames if _is_bad(each)]
+    if marked and len(marked) == len(listed_frames):
+        raise SceneError(f"{path} marks all of its {len(marked)} frames as bad (is_bad): none is left to train on")
+    bad = _names([name for name in marked if isinstance(name, str)], files, path)
     frames = [
         _frame(files, each, meta, applied, f"{path}, frame {k}")
         for k, each in enumerate(listed_frames, start=1)

@@ -147,7 +147,7 @@ def check_world(folder: Path, parsed: DataparserOutputs, what: str) -> None:
         image = parsed.image_filenames[0]
         raise SceneError(
             f"the scene of {image} is not the scene that the run {folder} was trained on, or its cameras have "
-            f"changed since: correct {what}"
+            f"changed since, as by photographs that were added: correct {what}"
         )
 
 

@@ -513,6 +513,16 @@ def test_frames_that_are_marked_as_bad_are_left_out(scene, caplog):
     assert "not in transforms.json" not in caplog.text
 
 
+def test_a_scene_whose_frames_are_all_marked_as_bad_is_refused(scene):
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame in meta["frames"]:
+        frame |= {"is_bad": True, "file_path": None}
+    path.write_text(json.dumps(meta))
+    with pytest.raises(SceneError, match=r"transforms\.json marks all of its 10 frames as bad"):
+        parse(scene)
+
+
 def test_photographs_larger_than_their_cameras_are_told_of(scene, caplog):
     parse(scene)
     assert "larger" not in caplog.text
