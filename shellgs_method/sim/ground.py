@@ -144,12 +144,14 @@ class Ground:
 
     @property
     def surface(self) -> Triangles:
-        """Two triangles for each cell, wound upwards."""
-        rows, columns = np.indices(self.heights.shape)
+        """Two triangles for each cell, or two in all of flat ground, wound upwards."""
+        every = (range(count) if np.ptp(self.heights) else (0, count - 1) for count in self.heights.shape)
+        rows, columns = np.meshgrid(*every, indexing="ij")
         vertices = np.stack(
-            [self.origin[0] + self.cell * columns, self.origin[1] + self.cell * rows, self.heights], axis=-1
+            [self.origin[0] + self.cell * columns, self.origin[1] + self.cell * rows, self.heights[rows, columns]],
+            axis=-1,
         )
-        number = np.arange(self.heights.size).reshape(self.heights.shape)
+        number = np.arange(rows.size).reshape(rows.shape)
         a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
         faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
         return Triangles(vertices.reshape(-1, 3), faces)
