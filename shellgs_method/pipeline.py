@@ -38,7 +38,7 @@ from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import guard_checkpoint_loading
 from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.host import mend_commands
-from shellgs_method.viewer import ContradictedShell
+from shellgs_method.viewer import ContradictedShell, StartAtCamera
 
 
 @dataclass
@@ -78,6 +78,9 @@ class FacadePipeline(VanillaPipeline):
             assert isinstance(datamanager, FacadeDataManager)
             scene = Path(datamanager.config.dataparser.data)
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
+            # At a training camera, its photograph would hide the render.
+            poses = datamanager.eval_dataset.cameras.camera_to_worlds
+            self.start_at_camera = StartAtCamera(poses[len(poses) // 2])
             if self.test_mode == "val":  # a trained run loads all its Gaussians
                 datamanager.train_on(model.config.training_cues)
                 model.objective.light = datamanager.light

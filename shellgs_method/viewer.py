@@ -1,4 +1,4 @@
-"""Layers for nerfstudio's viewer."""
+"""Where nerfstudio's viewer starts, and layers for it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float64
+import viser
+from jaxtyping import Float, Float64
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from shellgs_method.errors import notice
 from shellgs_method.geometry.similarity import transformed
@@ -16,6 +19,27 @@ from shellgs_method.occlusion import CONTRADICTED_PLACES
 
 POINT = 0.004
 """Point size relative to the cloud's longest side."""
+
+
+class StartAtCamera(ViewerControl):
+    """Each browser starts at a camera; where viser starts, a facade is behind it or a blur.
+
+    Args:
+        camera_to_world: pose in nerfstudio's world, OpenGL axes.
+    """
+
+    def __init__(self, camera_to_world: Float[Tensor, "3 4"]) -> None:
+        self._camera_to_world = camera_to_world.double().cpu().numpy()
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        viewer.viser_server.on_client_connect(self._place)
+
+    def _place(self, client: viser.ClientHandle) -> None:
+        axes = self._camera_to_world[:, :3] * (1, -1, -1)  # of viser's cameras: OpenCV
+        with client.atomic():
+            client.camera.position = self._camera_to_world[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+            client.camera.wxyz = Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]]
 
 
 class ContradictedShell(ViewerControl):

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import errno
 import shutil
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,14 +17,14 @@ import pytest
 import torch
 import trimesh
 from cameras import pinhole
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from PIL import Image
 from scenes import views_of
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, small_disk, trainer_of
-from viser import SceneApi
+from viser import SceneApi, ViserServer
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method import occlusion
@@ -757,8 +761,8 @@ def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
     assert np.asarray(cloud.colors)[contradicted, 1].max() < 100
 
 
-def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scene, tmp_path, monkeypatch):
-    """Places at the cameras' positions, which nerfstudio transforms to its own world."""
+def test_the_viewer_starts_at_a_camera_and_shows_contradicted_places(pristine_scene, tmp_path, monkeypatch):
+    """In nerfstudio's world, to which it transforms places that are the cameras' positions in the scene."""
     scene = tmp_path / "scene"
     shutil.copytree(pristine_scene, scene)
     views = views_of(scene)
@@ -776,11 +780,18 @@ def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scen
         shown[name] = points, kwargs
         return add(self, name, points, *args, **kwargs)
 
+    connected: list[Callable[[Any], None]] = []
     monkeypatch.setattr(SceneApi, "add_point_cloud", noting)
+    monkeypatch.setattr(ViserServer, "on_client_connect", lambda self, place: connected.append(place))
     trainer = trainer_of(scene, tmp_path, "photo_gs", change=with_viewer)
     points, settings = shown[ContradictedShell.LAYER]
     data = trainer.pipeline.datamanager
     poses = [dataset.cameras.camera_to_worlds for dataset in (data.train_dataset, data.eval_dataset)]
+    browser: Any = SimpleNamespace(atomic=nullcontext, camera=SimpleNamespace(fov=1.0, aspect=1.0))
+    connected[-1](browser)
+    assert isinstance(trainer.viewer_state, Viewer)
+    start = trainer.viewer_state.get_camera_state(browser).c2w
+    assert (poses[1] - start).abs().amax((1, 2)).min() < 1e-6
     trainer.shutdown()
     distance, _ = KDTree(points / VISER_NERFSTUDIO_SCALE_RATIO).query(torch.cat(poses)[..., 3].numpy())
     assert len(points) == len(views)
