@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from traceback import walk_stack
+from types import SimpleNamespace
+
 import torch
+from nerfstudio.configs import external_methods
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -12,6 +17,11 @@ from shellgs_method.losses.objective import ExtraLossConfig
 from shellgs_method.model import FacadeModelConfig
 from shellgs_method.pipeline import FacadePipelineConfig
 from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, PerViewAdamConfig, RunLengthDecayConfig
+
+# Once per method that is not installed, nerfstudio asks who calls: inspect.stack also reads the sources of all callers.
+vars(external_methods)["inspect"] = SimpleNamespace(
+    stack=lambda: [SimpleNamespace(function=frame.f_code.co_name) for frame, _ in walk_stack(sys._getframe(1))]
+)
 
 
 def _adam(lr: float, lr_final: float | None = None, of: type[FusedAdamConfig] = FusedAdamConfig) -> dict:

@@ -13,6 +13,7 @@ import pytest
 import torch
 import tyro
 from gsplat.strategy.ops import duplicate, remove
+from nerfstudio.configs import external_methods
 from nerfstudio.scripts.exporter import ExportGaussianSplat
 from scenes import views_of
 from torch.nn.functional import normalize
@@ -84,6 +85,17 @@ def test_the_papers_methods_start_from_the_sfm_points_alone():
     models = {name: getattr(method_configs, attribute).config.pipeline.model for name, attribute in METHODS.items()}
     assert {name for name, model in models.items() if model.init != "sfm"} == {"shellgs-metric"}
     assert "shellgs-metric" not in PAPER
+
+
+def test_methods_that_are_not_installed_are_listed_in_no_time_and_offered_if_chosen(monkeypatch):
+    asked = []
+    monkeypatch.setattr("inspect.stack", lambda: pytest.fail("takes seconds"))
+    monkeypatch.setattr("rich.prompt.Confirm.ask", lambda *_, **__: asked.append(1))
+    methods, _ = external_methods.get_external_methods()
+    assert not asked
+    with pytest.raises(SystemExit):
+        replace(next(iter(methods.values())))
+    assert asked
 
 
 def parsed(words: tuple[str, ...]):
