@@ -19,7 +19,7 @@ from shellgs_method.pipeline import FacadePipelineConfig
 from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, PerViewAdamConfig, RunLengthDecayConfig
 
 # Once per method that is not installed, nerfstudio asks who calls: inspect.stack also reads the sources of all callers.
-external_methods.inspect = SimpleNamespace(  # pyright: ignore[reportAttributeAccessIssue]
+external_methods.inspect = SimpleNamespace(  # pyright: ignore[reportPrivateImportUsage]
     stack=lambda: [SimpleNamespace(function=frame.f_code.co_name) for frame, _ in walk_stack(sys._getframe(1))]
 )
 
