@@ -58,9 +58,7 @@ def demo(
     console.print(f"$ {shlex.join(casting)}", style="bold")
     with Display(console) as display, display.work("scene") as tell, following(1) as pool:
         cast = pool.submit(follow, [casting], tell=tell)
-        # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
-        import nerfstudio.configs.method_configs  # noqa: F401
-
+        # Slow to import, so while the shell is cast.
         from shellgs_method.compare.results import compare
         from shellgs_method.compare.runs import grid
     try:

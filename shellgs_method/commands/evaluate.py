@@ -29,10 +29,6 @@ def evaluate(
             surface that `shellgs mesh` would write, at the points and between pairs of them, are printed and added to
             the output.
     """
-    # First, and from here: nerfstudio's registry inspects the call stack 26 times, which takes 1.5 s longer deep in our
-    # imports.
-    import nerfstudio.configs.method_configs  # noqa: F401
-
     from shellgs_method.compare.measure import write_metrics
     from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, against_truth, rich_table
 

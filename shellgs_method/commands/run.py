@@ -189,8 +189,6 @@ def _is_there(alignment: Path, scene: Path) -> bool:
 
 def _train(recipe: Recipe, scene: Path, results: Path, done: Record) -> Run:
     """Train and evaluate, unless that is done; an interrupted run resumes, one with other settings is put aside."""
-    import nerfstudio.configs.method_configs  # noqa: F401  (first: its import takes longer from deep in others)
-
     from shellgs_method.compare.results import compare
     from shellgs_method.compare.runs import DamagedRunError, OtherSettingsError, grid
     from shellgs_method.launch.local import launch_locally

@@ -29,7 +29,7 @@ DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterati
 
 def run(*words: object, cwd: Path, status: int = 0) -> str:
     """Output of `shellgs` in a process of its own, without the terminal's line breaks."""
-    environment = os.environ | {"OMP_WAIT_POLICY": "passive", "COLUMNS": "200"}
+    environment = os.environ | {"OMP_WAIT_POLICY": "passive", "COLUMNS": "200", "BROWSER": "touch opened %s"}
     command = [str(Path(sys.executable).with_name("shellgs")), *map(str, words)]
     done = subprocess.run(command, cwd=cwd, env=environment, text=True, capture_output=True)
     output = done.stdout + done.stderr
@@ -67,24 +67,18 @@ def test_the_demo_prints_its_progress_and_what_to_look_at_first(demo):
     assert "ns-viewer --load-config" in first[2]
 
 
-def test_a_second_demo_keeps_what_the_first_finished(demo, shellgs, monkeypatch):
+def test_a_second_demo_keeps_what_the_first_finished_and_opens_its_report_if_asked_to(demo, shellgs, monkeypatch):
+    assert not demo.with_name("opened").exists()
+    opened = []
     finished = [next(config(demo).parent.glob("nerfstudio_models/*.ckpt")), *demo.glob("scene/cues/shell/images/*.npz")]
     before = [path.stat().st_mtime_ns for path in finished]
     monkeypatch.chdir(demo.parent)
-    monkeypatch.setattr("webbrowser.open", lambda page: pytest.fail(f"{page} was opened"))
-    output = shellgs(*DEMO)
+    monkeypatch.setattr("webbrowser.open", lambda page: opened.append(page) or True)
+    output = shellgs(*DEMO, "--open")
     assert "Look first at" in output
     assert "$ ns-train" not in output
     assert [path.stat().st_mtime_ns for path in finished] == before
-
-
-def test_the_report_opens_in_the_browser_if_asked_for(demo, tmp_path, monkeypatch):
-    browser = tmp_path / "browser"
-    browser.write_text(f'#!/bin/sh\necho "$1" >> {tmp_path}/opened\n')
-    browser.chmod(0o755)
-    monkeypatch.setenv("BROWSER", f"{browser} %s")
-    run(*DEMO, "--open", cwd=demo.parent)
-    assert (tmp_path / "opened").read_text().strip() == (demo / "report.html").as_uri()
+    assert opened == [(demo / "report.html").as_uri()]
 
 
 def test_without_a_browser_the_page_is_named(monkeypatch, capsys):
@@ -238,10 +232,15 @@ def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, shellgs, tmp_path):
 
 
 def test_a_users_mistake_ends_the_command_with_one_sentence(tmp_path):
-    output = run("cast", "nowhere", cwd=tmp_path, status=1)
+    (tmp_path / "log.txt").touch()
+    output = run("demo", "log.txt", cwd=tmp_path, status=1)
     assert output.startswith("shellgs: ")
-    assert "nowhere" in output
+    assert "log.txt" in output
     assert output.count("\n") == 1
+
+
+def test_a_scene_that_is_not_there_is_refused_by_its_name(shellgs):
+    assert re.match("refused: shellgs: .*nowhere", shellgs("cast", "nowhere"))
 
 
 def test_a_shell_without_its_matrix_is_refused(shellgs):
@@ -254,8 +253,8 @@ def test_a_command_to_be_typed_quotes_a_path_with_blanks(shellgs):
     assert shellgs("pick", "my scene").endswith("name the shell's file: shellgs pick 'my scene' scan.ply")
 
 
-def test_doctor_lists_the_parts_of_this_machine(tmp_path):
-    output = run("doctor", cwd=tmp_path)
+def test_doctor_lists_the_parts_of_this_machine(shellgs):
+    output = shellgs("doctor")
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
 
 

@@ -42,7 +42,7 @@ def ends_with_the_cast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_command, "cast", cast)
 
 
-def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
+def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs, monkeypatch, capsys):
     photographs, shell, matrix = inputs
     words = ["--matrix", matrix, "--iterations", 3, "--method", "photo-gs", "--max-image-size", 32]
     told = shellgs("run", photographs, shell, *words, "--accept")
@@ -62,14 +62,16 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     assert "triangles" not in again  # no second mesh
     assert mesh.stat().st_mtime_ns == written
     settings = Path("scene.run")
-    settings.write_text(settings.read_text().replace("--iterations 3", "--iterations 2"))
-    assert "are now in scene-results/runs-1" in shellgs("run")
-    assert mesh.stat().st_mtime_ns != written
     settings.write_text(settings.read_text().replace("--method photo-gs", "--method shellgs"))
     assert "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
+    assert mesh.stat().st_mtime_ns != written
     assert (
         "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
     )  # of two methods there, that of the settings
+    settings.write_text(settings.read_text().replace("--iterations 3", "--iterations 2"))
+    monkeypatch.setattr("shellgs_method.launch.local.launch_locally", lambda runs, **_: dict.fromkeys(runs, "not now"))
+    assert "the training failed" in shellgs("run")
+    assert "are now in scene-results/runs-1" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
