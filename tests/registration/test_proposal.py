@@ -41,13 +41,6 @@ def unplaced(shell: str, crs: str = "") -> Alignment:
     return Alignment(np.eye(4), (shell,), crs=crs)
 
 
-def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
-    placement = place_by_guess(mesh, views, points, unplaced("shell/facade.ply"))
-    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
-    assert placement.proposed
-    assert error(surface, found, survey_from_scene) < 0.02
-
-
 def turned(axis: str) -> np.ndarray:
     """The motion that turns the shell so that an axis of its file, or none, is up."""
     if axis == "none":
@@ -61,8 +54,9 @@ def turned(axis: str) -> np.ndarray:
 def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
     motion = turned(axis)
     askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
-    alignment = place_by_guess(askew, views, points, unplaced("shell/facade.ply")).alignment
-    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
+    placement = place_by_guess(askew, views, points, unplaced("shell/facade.ply"))
+    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene @ motion)
+    assert placement.proposed
     assert error(surface, found, survey_from_scene) < 0.02
 
 
@@ -281,7 +275,9 @@ def test_points_exactly_in_a_plane_are_placed_on_a_shell_with_depth(mesh):
     assert len(found) < 3 * 150
 
 
-def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
+def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views, monkeypatch):
+    upright = lambda normals: [axes for axes in shell_axes(normals) if axes[1, 2] > 0.99]  # noqa: E731
+    monkeypatch.setattr(proposal, "shell_axes", upright)  # others take longer, and have no other bays
     layout = Layout(5, 3)
     openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
     random = np.random.default_rng(0)
