@@ -539,17 +539,17 @@ def test_what_is_near_the_camera_is_found_in_its_place_where_points_of_it_are(tm
         posts.append(post)
         shell.write(views[-1].name, CueMap(wall, normal, wall > 0), view.camera)
     on_wall, on_post = np.full((1000, 3), [0.0, 0.0, WALL]), np.full((20, 3), [0.3, 0.0, WALL / 4])
-    before = on_post * 2  # in the same pixel, at half of the depth
+    wrong = np.concatenate([on_post[:1], on_post * 2])  # in the same pixel, at half of the depth
     places = []
-    for near in (on_post[:0], on_post[:1], before, on_post):
+    for near in (on_post[:0], wrong, on_post):
         shutil.rmtree(tmp_path / "cues/checked", ignore_errors=True)
         check_views(tmp_path, views, [], SparsePoints(np.concatenate([on_wall, near])))
         checked = CueMaps.open(tmp_path, "checked").require(views[6].name, views[6].camera)
         places.append(checked.depth[posts[6]])
-    assert all((place == places[0]).all() for place in places[1:3])
+    assert (places[1] == places[0]).all()
     right = [(np.abs(place / (WALL / 4) - 1) < 0.1).mean() for place in places]
     assert right[0] < 0.1
-    assert right[3] > 0.8
+    assert right[2] > 0.8
 
 
 def test_an_interrupted_check_does_not_go_on_with_another_shell(tmp_path: Path, monkeypatch):
