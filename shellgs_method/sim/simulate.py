@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.atomic import atomic_contents, files_in, read_json, write_whole
@@ -20,6 +21,7 @@ from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.machine.progress import tell
+from shellgs_method.runs.run_folder import open_run
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, LEAKY, Collider, Leaks, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
@@ -115,12 +117,11 @@ def _world(
     log: Callable[[str], None],
 ) -> tuple[dict, list[Chapter]]:
     """Write the files of :func:`simulate`."""
+    _refuse_twice(configs)  # before hours of work, too
     names: list[str] = []
-    places: dict[tuple[Path, str], Path] = {}
     chapters, home = [], None
     for config in configs:
         run = TrainedRun.load(config)
-        _refuse_twice(run, config, places)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
@@ -148,12 +149,16 @@ def _world(
     return metrics, chapters
 
 
-def _refuse_twice(run: TrainedRun, config: Path, places: dict[tuple[Path, str], Path]) -> None:
-    """Refuse a run of a building that is in the world, and note where this one is."""
-    place = run.scene.resolve(), run.block
-    if place in places:
-        raise SceneError(f"{places[place]} and {config} are runs of the same building: give one of them")
-    places[place] = config
+def _refuse_twice(configs: Sequence[Path]) -> None:
+    """Refuse runs of the same building."""
+    places: dict[tuple[Path, str | None], Path] = {}
+    for config in configs:
+        manager = open_run(config).pipeline.datamanager
+        if isinstance(manager, FacadeDataManagerConfig) and manager.data is not None:
+            place = manager.data.resolve(), manager.dataparser.block  # pyright: ignore[reportAttributeAccessIssue]
+            if place in places:
+                raise SceneError(f"{places[place]} and {config} are runs of the same building: give one of them")
+            places[place] = config
 
 
 def _building(made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None]) -> Chapter:

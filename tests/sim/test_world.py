@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -163,13 +164,20 @@ SMALL = SimSettings(faces=4000)
 
 
 @pytest.fixture(scope="module")
-def made(config, tmp_path_factory) -> Path:
+def reported() -> list:
+    """What the report of the folder below was given."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def made(config, tmp_path_factory, reported) -> Path:
     """The folder of this run, with fewer and shorter throws; the results of the full trial are tested above."""
-    from shellgs_method.sim import report
+    from shellgs_method.sim import report, simulate
 
     out = tmp_path_factory.mktemp("sim") / "facade sim"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "throw", lambda *args: throw(*args, count=8, seconds=0.5))
+        patch.setattr(simulate, "write_report", lambda *given: reported.extend(given) or report.write_report(*given))
         cli.sim((config, out), replace(SMALL, test=True))
     return out
 
@@ -204,9 +212,11 @@ def test_the_command_writes_the_whole_folder(made):
     assert "nan" not in page
 
 
-def test_the_same_building_is_not_put_into_a_world_twice(config, tmp_path):
+def test_the_same_building_is_not_put_into_a_world_twice(config, tmp_path, monkeypatch):
+    monkeypatch.setattr("shellgs_method.export.runs.TrainedRun.load", lambda _: pytest.fail("hours of work"))
+    again = shutil.copytree(config.parent, tmp_path / "again") / config.name
     with pytest.raises(SceneError, match="are runs of the same building: give one of them"):
-        cli.sim((config, config, tmp_path / "sim"), SMALL)
+        cli.sim((config, again, tmp_path / "sim"), SMALL)
     assert not [*(tmp_path / "sim").iterdir()]
 
 
@@ -224,12 +234,11 @@ def test_every_file_that_the_readme_names_is_there(made):
         assert (made / path).is_file()
 
 
-def test_a_world_with_no_place_to_throw_from_is_kept_and_says_so(config, tmp_path, monkeypatch):
+def test_a_world_with_no_place_to_throw_from_is_kept_and_says_so(made, reported, tmp_path, monkeypatch):
     from shellgs_method.sim import report
 
     monkeypatch.setattr(report, "throw", lambda world, surface, _, eyes: throw(world, surface, Ground.level(99), eyes))
-    cli.sim((config, tmp_path / "sim"), replace(SMALL, test=True))
-    metrics = json.loads((tmp_path / "sim" / "metrics.json").read_text())
+    metrics = report.write_report(shutil.copytree(made, tmp_path / "sim"), *reported[1:])
     assert "throws" not in metrics
     assert metrics["summary"][0] == (
         "Nothing was thrown: there is no place in front of the building to throw from: are the cameras outside?"
