@@ -9,14 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-import wandb
 from matplotlib import colormaps
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training_runs import trainer_of
-from wandb.errors import UsageError
-from wandb.proto.wandb_internal_pb2 import Record
-from wandb.sdk.internal.datastore import DataStore
 
 from shellgs_method.evaluation.colours import GREY, MAX_ERROR
 from shellgs_method.trainer import FacadeTrainer
@@ -93,6 +89,8 @@ def test_the_error_image_agrees_with_the_metric(tensorboard):
 
 @pytest.mark.usefixtures("offline_wandb")
 def test_wandb_offline_gets_all_that_tensorboard_gets(tensorboard, pristine_scene, tmp_path):
+    import wandb  # slow
+
     trainer = watched(pristine_scene, tmp_path, "wandb")
     wandb.teardown()  # finish does not wait for the process that writes the file
     (run,) = trainer.base_dir.glob("wandb/offline-run-*")
@@ -112,6 +110,9 @@ def test_wandb_offline_gets_all_that_tensorboard_gets(tensorboard, pristine_scen
 
 def recorded(run: Path) -> Iterator[tuple[str, str]]:
     """Names and values that an offline run has recorded."""
+    from wandb.proto.wandb_internal_pb2 import Record
+    from wandb.sdk.internal.datastore import DataStore
+
     store = DataStore()
     store.open_for_scan(str(next(run.glob("*.wandb"))))
     while data := store.scan_data():
@@ -122,9 +123,11 @@ def recorded(run: Path) -> Iterator[tuple[str, str]]:
 
 
 def test_wandb_without_a_key_ends_with_one_sentence(pristine_scene, tmp_path, monkeypatch):
+    from wandb.errors import UsageError
+
     def refuse(**_):
         raise UsageError("No API key configured.")
 
-    monkeypatch.setattr(wandb, "init", refuse)
+    monkeypatch.setattr("wandb.init", refuse)
     with pytest.raises(SystemExit, match=r"^shellgs: .*No API key configured.*WANDB_MODE=offline"):
         watched(pristine_scene, tmp_path, "wandb")
