@@ -7,8 +7,10 @@ demo: .venv/checked  ## install; make the synthetic facade, train photo-gs and s
 	$(BIN)/shellgs demo
 
 # Threads of OpenMP and of BLAS spin while they wait; training adapts to what else runs (threads.py), but these tests are short.
+# Where a container forbids Python to write bytecode, each process of the tests would compile all modules again.
 test: export OMP_WAIT_POLICY ?= passive
 test: export OPENBLAS_NUM_THREADS ?= 1
+test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/dev .venv/checked  ## install; format, lint, types, imports, tests
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
