@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 from shellgs_method.files.atomic import content_hash, fingerprint, write_whole
 from shellgs_method.files.cue_maps import CueMaps, Manifest, tolerated
 from shellgs_method.files.map_files import BACKGROUND, CueMap
-from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.files.photographs import View, load_mask, load_photograph, upright_size
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
@@ -292,6 +292,7 @@ def _told_apart(
 
 def _shell_view(view: View, cue: CueMap, points: SparsePoints | None) -> ShellView:
     camera = view.camera.shrunk(MAX_SIZE)
+    upright_size(view)  # refuses a photograph of another shape by the size of its own camera
     view = replace(view, camera=camera)
     image = load_photograph(view)
     depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from shellgs_method.files.atomic import write_whole
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.files.map_files import CueMap
-from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.photographs import View, load_photograph, upright_size
 from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import project
 from shellgs_method.geometry.similarity import transformed
@@ -108,6 +108,7 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
         before = {support.view.name: support.view.camera for support in earlier.views}
         caster_before = ShellCaster(mesh, earlier.alignment.shell_to_scene)
     for number, support in enumerate(_shown(validation), start=1):
+        upright_size(support.view)  # refuses a photograph of another shape by the size of its own camera
         camera = support.view.camera.shrunk(_OVERLAY)
         camera = camera.scaled(max(1.0, _LEAST / max(camera.width, camera.height)))
         view = replace(support.view, camera=camera)

@@ -26,7 +26,10 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.scene import SceneLayout
+from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.occlusion import check, check_views
 from shellgs_method.registration.align import PROPOSAL, REPORT
 from shellgs_method.registration.report import shell_edges, write_report
 from shellgs_method.registration.validation import validate
@@ -541,6 +544,21 @@ def test_a_report_is_written_even_if_no_camera_sees_the_shell(mesh, views, point
     validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, ("<shell>.ply",)), views, points)
     page = write_report(tmp_path / "report", mesh, validation).read_text()
     assert "&lt;shell&gt;.ply: refused" in page
+
+
+def test_a_photograph_of_another_shape_is_refused_by_the_size_of_its_camera(scene, tmp_path, monkeypatch):
+    views, points = views_of(scene), read_sparse_points(SceneLayout(data=scene))
+    alignment = Alignment.load(scene / ALIGNMENT)
+    mesh = load_shell(*alignment.files(scene))
+    validation = validate(mesh, alignment, views, points)
+    monkeypatch.setattr(check, "MAX_SIZE", 24)
+    for view in views:
+        Image.open(view.image).resize((48, 48)).save(view.image)
+    refused = "is 48x48 pixels, but its camera is 48x32"
+    with pytest.raises(SceneError, match=refused):
+        write_report(tmp_path / "report", mesh, validation)
+    with pytest.raises(SceneError, match=refused):
+        check_views(scene, views, set(), points)
 
 
 def test_a_shell_in_the_frame_of_the_cameras_needs_no_matrix_and_its_system_is_kept(scene, shellgs, tmp_path):
