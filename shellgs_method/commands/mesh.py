@@ -30,6 +30,7 @@ def mesh(
         faces: Number of triangles that the mesh is decimated to.
         margin: Distance from the shell, in metres, beyond which geometry is left out.
     """
+    from shellgs_method.evaluation.regions import REFERENCES
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, against_truth, rich_table
     from shellgs_method.export.meshes import METRE_FORMATS, check_mesh_format, write_mesh
     from shellgs_method.export.runs import TrainedRun, mesh_errors
@@ -38,11 +39,12 @@ def mesh(
     output = output or config.parent / "mesh.ply"
     check_mesh_format(output)
     run = TrainedRun.load(config)
+    run.check_maps((*REFERENCES, "checked"))
     surface = decimated_mesh(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)
     write_mesh(output, surface, run.frame, metrics)
     rows = {"against the shell": metrics, "against the ground truth": against_truth(metrics)}
-    rows = {name: row for name, row in rows.items() if "rendered" in row}
+    rows = {name: row for name, row in rows.items() if any(column.key in row for column in SURFACE_COLUMNS)}
     console.print(
         f"{output}: {len(surface.faces)} triangles, voxels of {surface.metadata['voxel']:.3g}. {place(run.frame)}"
     )

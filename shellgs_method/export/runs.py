@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -92,6 +92,17 @@ class TrainedRun:
     def photographs(self) -> list[View]:
         """The photographs of both."""
         return [view for dataset in self.datasets for view in dataset.views]
+
+    def check_maps(self, kinds: Collection[str]) -> None:
+        """Refuse outdated maps of these kinds, before work at whose end they are read.
+
+        Raises:
+            SceneError: a map is of another camera, shell or alignment.
+        """
+        found = self.datamanager.train_dataparser_outputs.metadata["cues"]
+        for maps in (found[kind] for kind in kinds if kind in found):
+            for view in self.photographs:
+                maps.check(view.name, view.camera, any_size=True)
 
     def outputs(self, dataset: FacadeDataset, index: int) -> dict[str, Tensor]:
         """What the model renders of a view of one of them."""

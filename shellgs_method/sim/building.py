@@ -100,8 +100,10 @@ class Reconstruction:
             home: frame of the world to join; a frame of its own if None.
 
         Raises:
-            SceneError: nothing is rendered, or the building does not fit into that world.
+            SceneError: nothing is rendered, the maps are outdated, or the building does not fit into that world.
         """
+        if "checked" in find_cues(run.scene):
+            run.check_maps(("shell", "checked"))
         views = run.photographs
         hidden: list[np.ndarray] = []
         below: list[np.ndarray] = [run.sfm_points]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from scenes import edited
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from splat_files import glb_attributes
@@ -26,7 +28,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.decimation import decimated_mesh
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse
-from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
@@ -369,16 +371,30 @@ def test_a_scene_without_alignment_is_meshed_in_its_own_frame(run, pristine_scen
     assert mesh_errors(alone, mesh)["truth_chamfer_units"] < 0.1
 
 
-def test_a_trained_run_becomes_a_mesh_with_metrics(pristine_scene, tmp_path):
-    trainer = trainer_of(pristine_scene, tmp_path, iterations=5)
+def test_a_trained_run_becomes_a_mesh_with_metrics_where_its_maps_and_their_unit_are_known(scene, tmp_path, capsys):
+    trainer = trainer_of(scene, tmp_path, iterations=5)
     trainer.train()
     trainer.config.save_config()
     config = trainer.base_dir / "config.yml"
     cli.mesh(config, tmp_path / "facade.obj", voxel=0.3, faces=500)
+    assert "The mesh in the held-out views" in capsys.readouterr().out
     about = json.loads((tmp_path / "facade.obj.json").read_text())
     assert about["faces"] <= 500
     assert {"chamfer_m", "f_score_5cm", "truth_chamfer_m"} <= about.keys()
     assert len(load_shell(tmp_path / "facade.obj").faces) == about["faces"]
+    shutil.copytree(scene / "cues/shell", scene / "cues/checked")
+    with edited(scene / ALIGNMENT) as alignment:
+        alignment["shell_to_scene"][0][3] += 0.1
+    loaded = TrainedRun.load(config)
+    for work in (lambda: cli.mesh(config), lambda: Reconstruction.of(loaded, 500, None, None, None)):
+        with pytest.raises(SceneError, match="has changed since; run `shellgs cast"):
+            work()
+    assert "Rendering view" not in capsys.readouterr().out  # refused before
+    (scene / ALIGNMENT).unlink()
+    cli.mesh(config, voxel=0.05, faces=500)
+    told = capsys.readouterr().out
+    assert "in units of unknown size" in " ".join(told.split())
+    assert "The mesh in the held-out views" not in told
 
 
 @pytest.mark.parametrize(
