@@ -39,6 +39,7 @@ def mesh(
     output = output or config.parent / "mesh.ply"
     check_mesh_format(output)
     run = TrainedRun.load(config)
+    run.check_output(output)
     run.check_maps((*REFERENCES, "checked"))
     surface = decimated_mesh(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)

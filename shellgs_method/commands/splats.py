@@ -43,6 +43,7 @@ def splats(
     check_splats_format(output)
     check_splats_format(output, discs=getattr(open_run(config).pipeline.model, "primitive", None) == "2d")
     run = TrainedRun.load(config)
+    run.check_output(output)
     gaussians, frame, background = run.splats(), run.frame, run.model.background_color.tolist()
     facts: dict[str, object] = {"background": background}
     where = place(frame)

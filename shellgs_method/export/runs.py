@@ -104,6 +104,16 @@ class TrainedRun:
             for view in self.photographs:
                 maps.check(view.name, view.camera, any_size=True)
 
+    def check_output(self, path: Path) -> None:
+        """Refuse to write over the shell, which may be the only copy of a scan.
+
+        Raises:
+            SceneError: names the file.
+        """
+        shell = self.shell[0].files(self.scene) if self.shell else []
+        if path.resolve() in (file.resolve() for file in shell):
+            raise SceneError(f"{path} is a file of the shell, which would be lost: name another --output")
+
     def outputs(self, dataset: FacadeDataset, index: int) -> dict[str, Tensor]:
         """What the model renders of a view of one of them."""
         return self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.model.device))

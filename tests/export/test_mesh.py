@@ -382,6 +382,10 @@ def test_a_trained_run_becomes_a_mesh_with_metrics_where_its_maps_and_their_unit
     assert about["faces"] <= 500
     assert {"chamfer_m", "f_score_5cm", "truth_chamfer_m"} <= about.keys()
     assert len(load_shell(tmp_path / "facade.obj").faces) == about["faces"]
+    (tmp_path / "link.ply").symlink_to(scene / "shell/facade.ply")
+    for write, path in ((cli.mesh, scene / "shell/facade.ply"), (cli.splats, tmp_path / "link.ply")):
+        with pytest.raises(SceneError, match=f"{path} is a file of the shell"):
+            write(config, path)
     shutil.copytree(scene / "cues/shell", scene / "cues/checked")
     with edited(scene / ALIGNMENT) as alignment:
         alignment["shell_to_scene"][0][3] += 0.1
