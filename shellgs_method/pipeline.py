@@ -189,6 +189,17 @@ class FacadePipeline(VanillaPipeline):
                 "again."
             )
 
+    def _tell_of_other_maps(self, trained_with: Mapping[str, Mapping[str, str]]) -> None:
+        """Report maps that were made again since the checkpoint, as after another alignment."""
+        parsed = self.datamanager.train_dataparser_outputs
+        for kind, maps in parsed.metadata["cues"].items():
+            then, now = trained_with.get(kind, {}), maps.manifest.sources
+            if changed := [source for source in now if then.get(source, now[source]) != now[source]]:
+                notice(
+                    f"the {kind} maps of {maps.scene} were made again since the checkpoint was trained, from another "
+                    f"{' and '.join(changed)}, and its surface follows the old ones: train again from the start."
+                )
+
     def _find_exposures(self, trained_on: Sequence[str]) -> None:
         """Find the exposures of the scene's photographs by their names: some may have been taken out since training."""
         ours = self.model.exposures
@@ -205,7 +216,9 @@ class FacadePipeline(VanillaPipeline):
         return super().get_train_loss_dict(step)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """State for checkpoints: the cameras, and that of the training, with sums, remaining views and generators."""
+        """State for checkpoints: the cameras, what the maps were made from, and that of the training, with sums,
+        remaining views and generators.
+        """
         if self.test_mode != "val":
             return {}
         data, sums = self.datamanager, self.model.strategy_state
@@ -213,6 +226,7 @@ class FacadePipeline(VanillaPipeline):
         return {
             "block": dict(self._block),
             "cameras": BoundCameras.of(data.train_dataset.views).to_json(),
+            "maps": {kind: maps.manifest.sources for kind, maps in data.train_dataset.cues.items()},
             "densification": {name: value for name, value in sums.items() if isinstance(value, Tensor)},
             "views": list(data.train_unseen_cameras),
             "order": order and list(map(_listed, order.getstate())),
@@ -236,6 +250,7 @@ class FacadePipeline(VanillaPipeline):
         block = state.get("block") or {}
         if self.test_mode != "val" and block and block["region"] != self._cell().fingerprint:
             raise SceneError(f"{block['name']} has been cut again since the run was trained: train it again")
+        self._tell_of_other_maps(state.get("maps", {}))
 
     def restore_training(self) -> None:
         """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.

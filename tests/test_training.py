@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from alignments import shifted
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from scenes import cast, views_of
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, densify_early, held_out, model_of, render, trainer_of
 
@@ -30,6 +32,7 @@ from shellgs_method.losses.objective import KEPT_BYTES, MAX_KEPT_SHARE
 from shellgs_method.machine import cpp, progress
 from shellgs_method.machine.progress import Stage
 from shellgs_method.render.maps import geometry_channels
+from shellgs_method.shell import ALIGNMENT
 from shellgs_method.trainer import FacadeTrainer
 
 
@@ -394,6 +397,17 @@ def test_a_run_is_not_resumed_over_other_cameras(pristine_scene, tmp_path):
     path.write_text(json.dumps(cameras))
     with pytest.raises(SystemExit, match=r"is not the scene that the run .*: correct --data, or train again"):
         trainer_of(scene, tmp_path / "second", "photo_gs", 6, first.checkpoint_dir)
+
+
+@pytest.mark.parametrize(("right", "told"), [(0.0, False), (0.1, True)])
+def test_a_run_is_told_of_maps_that_were_cast_again_after_another_alignment(scene, tmp_path, caplog, right, told: bool):
+    cast(scene, views_of(scene), shifted())
+    first = trainer_of(scene, tmp_path / "first", iterations=2)
+    first.train()
+    cast(scene, views_of(scene), shifted(right))
+    trainer_of(scene, tmp_path / "second", iterations=4, load_dir=first.checkpoint_dir)
+    words = f"the shell maps of {scene} were made again since the checkpoint was trained, from another {ALIGNMENT}, and"
+    assert (words in caplog.text) is told
 
 
 @pytest.mark.parametrize(("interval", "told"), [(8, False), (9, True)])
