@@ -31,6 +31,7 @@ from shellgs_method.registration.picks import PickedPoint, align_picks, picked_a
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
 from shellgs_method.registration.refinement import refine
+from shellgs_method.registration.support import NEAR
 from shellgs_method.registration.validation import Check, check_of, rounding_of, steps_in_metres
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
@@ -45,6 +46,7 @@ REPORT = Path("shell/report")
 
 _RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
 _ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
+_THERE = 0.5  # share of the SfM points near a shell, from which it is not elsewhere, whatever its size
 _LOCAL = 10_000  # metres from the origin, within which a shell is not in a coordinate reference system
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
@@ -310,12 +312,25 @@ def up_in_words(alignment: Alignment) -> str:
 
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
-    """How a placement puts the shell elsewhere, or makes it larger or smaller, than what cameras see; None if not."""
+    """How a placement puts the shell elsewhere, or makes it larger or smaller, than what cameras see; None if not.
+
+    A proposal has the size and the place that fit best, and is judged by its fit alone.
+    """
+    if placement.proposed:
+        return None
     alignment = placement.alignment
     seen = np.concatenate([points.positions, positions(view.camera for view in views)])
     shell = transformed(mesh.vertices, alignment.shell_to_scene)
     up = alignment.rotation @ usual_up(alignment.shells)
-    return apart(shell, seen) or heights_apart(shell, points.positions, up, alignment.metres_per_unit)
+    words = apart(shell, seen) or heights_apart(shell, points.positions, up, alignment.metres_per_unit)
+    return words if words and _share_on(mesh, alignment, points) < _THERE else None  # a city may be so large
+
+
+def _share_on(mesh: ShellMesh, alignment: Alignment, points: SparsePoints) -> float:
+    """Share of the SfM points that are within a metre of the shell."""
+    surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
+    placed = transformed(points.positions, surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene))
+    return float((surface.distance(placed) < NEAR).mean()) if len(placed) else 0.0
 
 
 def refined(

@@ -13,7 +13,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
-from shellgs_method.registration.align import Placement, refined
+from shellgs_method.registration.align import Placement, misplaced, refined
 from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.validation import validate
 from shellgs_method.shell import Alignment, ShellMesh
@@ -33,6 +33,14 @@ def test_refinement_does_not_follow_points_in_single_precision(mesh, views, poin
     ):
         refined(placement, mesh, views, rounded, 0.3)
     assert "Refined" in refined(placement, mesh, views, SparsePoints(exact), 0.3).history[-1]
+
+
+def test_a_building_that_stands_where_points_show_it_is_not_misplaced_with_all_of_its_city(mesh, views, points):
+    city = np.concatenate([mesh.vertices + np.array([far, far, 0.0]) for far in (0, -600, 600)])
+    faces = np.concatenate([mesh.faces + k * len(mesh.vertices) for k in range(3)])
+    assert misplaced(Placement(shifted()), ShellMesh(city, faces), views, points) is None
+    elsewhere = misplaced(Placement(shifted(up=20.0)), ShellMesh(city, faces), views, points)
+    assert "look for another unit" in (elsewhere or "")
 
 
 def test_points_beyond_the_last_gate_by_rounding_count(surface, points, survey_from_scene):
