@@ -287,6 +287,10 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
         off = tags.apart(best.survey_from_scene)
         said = ": it agrees with none, so check that the building and --crs are the right ones" if off >= REACH else ""
         history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
+        if tags.repeated:
+            history.append(
+                "Most geo-tags repeat each other, as of a phone without a signal: check that this is the building."
+            )
     elif is_far and not unplaced.crs and has_geo_tags(views):
         history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
     history += [

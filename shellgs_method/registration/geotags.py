@@ -22,6 +22,7 @@ from shellgs_method.geometry.similarity import transformed
 REACH = 10.0
 """Median distance in metres of cameras from their geo-tags, beyond which an alignment is a wrong one; between
 buildings, signals are reflected."""
+_WALK = 50.0  # metres, within which photographs of a building were taken that have the same geo-tag
 _LEAST = 3
 _SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 
@@ -69,7 +70,13 @@ class GeoTags:
         """
         level = self.cameras - np.outer(self.cameras @ up, up) / (up @ up)
         there, here = (np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)) for p in (self.places, level))
-        return max(there - REACH, 0.0) / max(here, 1e-12), (there + REACH) / max(here, 1e-12)
+        reach = _WALK if self.repeated else REACH
+        return max(there - reach, 0.0) / max(here, 1e-12), (there + reach) / max(here, 1e-12)
+
+    @property
+    def repeated(self) -> bool:
+        """Whether most photographs have the place of another: without a signal, phones repeat the last they knew."""
+        return 2 * len(np.unique(self.places, axis=0)) < len(self.places)
 
     def shift(self, similarity: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 2"]:
         """The shift, in metres to the east and north, that takes cameras to their geo-tags in the median.

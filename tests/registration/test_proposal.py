@@ -174,6 +174,23 @@ def test_geo_tags_bound_the_scale_and_the_shift(tmp_path, views, surface, survey
     np.testing.assert_allclose(shift, survey_from_scene[:2, 3], atol=3.0)
 
 
+def test_geo_tags_of_a_phone_that_repeats_its_last_place_leave_the_scale_open(
+    tmp_path, mesh, views, points, surface, survey_from_scene, monkeypatch
+):
+    """Photographs along 60 m with one place, which by themselves would all have been taken within 10 m of it."""
+    shown = tagged(tmp_path, views, 3.0)
+    for view in shown[1:]:
+        view.image.write_bytes(shown[0].image.read_bytes())
+    tags = GeoTags.of(shown, "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    wide = replace(tags, cameras=4 * tags.cameras)
+    least, greatest = wide.scales(SCENE_FROM_BUILDING[:3, 2])
+    assert least < scale_of(survey_from_scene) < greatest
+    monkeypatch.setattr(align, "propose", lambda *_: [Candidate(survey_from_scene, score=0.9)])
+    history = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832")).history
+    assert any(sentence.startswith("Most geo-tags repeat each other") for sentence in history)
+
+
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.001])
 def test_geo_tags_are_told_of_if_a_shell_is_as_far_as_in_a_system(
     tmp_path, mesh, views, points, monkeypatch, metres_per_unit
