@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.geometry.triangles import Triangles
 
 FINAL_GATE = 0.05
@@ -122,8 +122,20 @@ def refine(
         if gate == last and np.abs(step - np.eye(4)).max() < 1e-7:
             break
     assert evidence is not None
+    if not relative and evidence.weak.any():
+        similarity = _held(similarity @ np.linalg.inv(survey_from_scene), evidence) @ survey_from_scene
     moved = transformed(points[used], similarity) - start[used]
     return Refinement(similarity, evidence, float(np.sqrt((moved**2).sum(axis=1).mean())))
+
+
+def _held(motion: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """A motion without its part along directions that the points do not determine: those beyond the last limit did."""
+    scale = scale_of(motion)
+    turn = Rotation.from_matrix(motion[:3, :3] / scale).as_rotvec()
+    shift = transformed(evidence.centre[None], motion)[0] - evidence.centre
+    update = np.concatenate([shift, evidence.radius * turn, [evidence.radius * np.log(scale)]])
+    weak = evidence.directions[evidence.weak]
+    return similarity_by(update - weak.T @ (weak @ update), evidence.centre, evidence.radius)
 
 
 def _solve(

@@ -107,6 +107,21 @@ def test_a_bare_wall_determines_three_directions_and_leaves_the_other_four_uncha
     assert all(word not in words for word in ("out of the facade", "tilt", "turn"))
 
 
+def test_what_only_points_beyond_the_last_limit_determine_is_left_unchanged():
+    """Some of a gutter above the roof of a box, as city models have them, would raise it by decimetres."""
+    corners = np.array([[-8.0, 0, -4], [8, 0, -4], [8, 0, 4], [-8, 0, 4], [8, 6, 4], [-8, 6, 4]])
+    surface = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])))
+    random = np.random.default_rng(0)
+    wall = random.uniform([-6, 0, -3], [6, 0, 3], (20_000, 3)) + random.normal(0, 0.01, (20_000, 1)) * [0, 1, 0]
+    gutter = random.uniform([-6, 0.1, 4.1], [6, 1, 4.4], (60, 3))
+    start = surface.survey_from_shell.copy()
+    start[1, 3] += 0.1
+    found = refine(surface, np.concatenate([wall, gutter]), start, reach=0.5)
+    assert any("upwards" in words for words in found.evidence.in_words(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])))
+    moved = found.survey_from_scene @ np.linalg.inv(start)
+    np.testing.assert_allclose(transformed(wall[:9], moved) - wall[:9], [[0, -0.1, 0]] * 9, atol=0.01)
+
+
 def test_points_of_something_else_are_refused(surface, survey_from_scene):
     with pytest.raises(SceneError, match="only 0 SfM points are within 1 m"):
         refine(surface, np.full((50, 3), 1000.0), survey_from_scene, reach=1.0)
