@@ -314,3 +314,14 @@ def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mes
     points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
     history = place_by_guess(mesh, views, points, unplaced("shell/facade.ply")).history
     assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)
+
+
+def test_a_candidate_stays_where_refining_it_makes_it_worse(surface, views, points, survey_from_scene, monkeypatch):
+    """As beside houses that are the same, whose walls are within reach."""
+    worse = SimpleNamespace(survey_from_scene=displaced(2.0, 0.0, 0.0, seed=1) @ survey_from_scene)
+    monkeypatch.setattr(proposal, "refine", lambda *_, **__: worse)
+    seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
+    fit = proposal._Fit.of(surface, surface.samples(500)[0], seen)
+    (found,) = fit.refined(Candidate(survey_from_scene, 0.0), 250, 3.0, 0.012, 10)
+    np.testing.assert_array_equal(found.survey_from_scene, survey_from_scene)
+    assert found.score > 0.8
