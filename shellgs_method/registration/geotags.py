@@ -23,6 +23,7 @@ REACH = 10.0
 """Median distance in metres of cameras from their geo-tags, beyond which an alignment is a wrong one; between
 buildings, signals are reflected."""
 _WALK = 50.0  # metres, within which photographs of a building were taken that have the same geo-tag
+_SPOT = 1.0  # metres, within which tags are on one spot
 _LEAST = 3
 _SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 
@@ -75,8 +76,12 @@ class GeoTags:
 
     @property
     def repeated(self) -> bool:
-        """Whether most photographs have the place of another: without a signal, phones repeat the last they knew."""
-        return 2 * len(np.unique(self.places, axis=0)) < len(self.places)
+        """Whether most photographs have the place of another, or all about the same one: then they tell no scale.
+
+        Without a signal, phones repeat the last place they knew.
+        """
+        spread = np.median(np.linalg.norm(self.places - np.median(self.places, axis=0), axis=1))
+        return bool(2 * len(np.unique(self.places, axis=0)) < len(self.places) or spread < _SPOT)
 
     def shift(self, similarity: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 2"]:
         """The shift, in metres to the east and north, that takes cameras to their geo-tags in the median.
@@ -85,6 +90,15 @@ class GeoTags:
             similarity: rotation from the scene to the shell's frame, times the scale.
         """
         return np.median(self.places - (self.cameras @ similarity.T)[:, :2], axis=0)
+
+    def scatter(self, similarity: Float64[np.ndarray, "3 3"]) -> float:
+        """Median distance, on the ground, of cameras from their geo-tags without the shift of all, in metres.
+
+        Args:
+            similarity: rotation from the scene to the shell's frame, times the scale.
+        """
+        placed = (self.cameras @ similarity.T)[:, :2] + self.shift(similarity)
+        return float(np.median(np.linalg.norm(placed - self.places, axis=1)))
 
     def apart(self, survey_from_scene: Float64[np.ndarray, "4 4"]) -> float:
         """Median distance, on the ground, of cameras from their geo-tags under an alignment, in metres."""

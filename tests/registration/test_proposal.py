@@ -325,3 +325,28 @@ def test_a_candidate_stays_where_refining_it_makes_it_worse(surface, views, poin
     (found,) = fit.refined(Candidate(survey_from_scene, 0.0), 250, 3.0, 0.012, 10)
     np.testing.assert_array_equal(found.survey_from_scene, survey_from_scene)
     assert found.score > 0.8
+
+
+def walked(noise: float = 0.0, spot: bool = False) -> GeoTags:
+    """Geo-tags of a walk of 60 m around a corner, in a scene whose unit is half a metre, by a phone."""
+    way = np.array([[min(k, 30.0), max(k - 30.0, 0.0), 0.0] for k in range(0, 60, 3)])
+    places = (way[:, :2] + np.random.default_rng(0).normal(0, noise, (len(way), 2))) * (not spot)
+    return GeoTags(way * 2, places - np.array([0.0, 8.0]))
+
+
+def test_geo_tags_on_one_spot_tell_no_scale():
+    least, greatest = walked(spot=True).scales(np.array([0.0, 0, 1]))
+    assert least < 0.5 < greatest
+
+
+def test_orientations_and_scales_under_which_geo_tags_scatter_are_not_tried():
+    tags, random = walked(noise=3.0), np.random.default_rng(0)
+    wall = random.uniform(0, [20, 0.1, 8], (2000, 3))
+    sight: Any = SimpleNamespace(points=2 * wall, origins=2 * wall - [0.0, 16.0, 0.0])
+    search = proposal._Search.of(wall, proposal._Seen(2 * wall, sight, np.eye(3)), tags.scales(np.eye(3)[2]), tags)
+    ahead, around = np.eye(3), np.diag([-1.0, -1.0, 1.0])
+    scatter = search.scatter([ahead, around])
+    assert not list(search.placed(around, scatter))
+    scales = [scale_of(found.survey_from_scene) for found in search.placed(ahead, scatter)]
+    assert 0.2 < min(scales) < 0.5 < max(scales) < 0.9
+    assert replace(search, tags=walked(spot=True)).scatter([ahead, around]) == np.inf
