@@ -43,9 +43,8 @@ _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
 _MEASURED, _POLISHED = 1000, 12
-# Candidates, share of the best score from which they are refined (rivals that prove a place ambiguous too; first, what
-# is a cell off scores little), SfM points, how far apart and off in cells, steps:
-_ROUNDS = ((500, 0.4, 250, 1, 2, 10), (150, 0.6, 800, 1, 4, 20))
+_ROUNDS = ((500, 250, 1, 2, 10), (150, 800, 1, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_HOPEFUL = 0.6  # share of the best score from which candidates are refined: rivals that prove a place ambiguous too
 _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
@@ -307,11 +306,11 @@ class _Fit:
         starts = self.distinct(starts, _MEASURED, cell)
         measured = track(starts, "Measuring candidates", len(starts))
         starts = [self.measured(start.survey_from_scene, _ROUGH) for start in measured]
-        for number, (count, hopeful, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
+        for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
             starts = self.distinct(starts, count, apart * cell)
-            starts = [start for start in starts if start.score > hopeful * starts[0].score]
-            shown = track(starts, f"Refining candidates, round {number}", len(starts))
-            starts = [found for s in shown for found in self.refined(s, few, reach * cell, _COARSE, steps)]
+            starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
+            hopeful = track(starts, f"Refining candidates, round {number}", len(starts))
+            starts = [found for s in hopeful for found in self.refined(s, few, reach * cell, _COARSE, steps)]
         starts, polished = self.distinct(starts, _POLISHED, self.different(starts)), []
         for start in track(starts, "Refining the best", len(starts)):
             reach = 2 * _COARSE * self.sight.distance(start.survey_from_scene)
@@ -335,7 +334,7 @@ class _Fit:
     def refined(self, start: Candidate, few: int, reach: float, tolerance: float, steps: int) -> list[Candidate]:
         """The candidate refined from an error of ``reach`` metres, and measured; none if too few points are in reach.
 
-        As it was, where it agreed better: walls beside the right one, within reach, pull it off.
+        As it was, where it agreed far better: walls beside the right one, within reach, pull it off.
 
         Args:
             start: the candidate.
@@ -350,8 +349,8 @@ class _Fit:
             found = refine(self.surface, points, start.survey_from_scene, reach, last=last, steps=steps, relative=far)
         except SceneError:
             return []
-        both = (self.measured(each, tolerance) for each in (found.survey_from_scene, start.survey_from_scene))
-        return [max(both, key=lambda candidate: candidate.score)]
+        after, before = (self.measured(each.survey_from_scene, tolerance) for each in (found, start))
+        return [after if after.score > AMBIGUOUS * before.score else before]
 
     def distinct(self, candidates: Sequence[Candidate], count: int, apart: float) -> list[Candidate]:
         """Up to ``count`` candidates, best first, each the best of those less than ``apart`` metres from it."""
