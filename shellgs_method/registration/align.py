@@ -46,7 +46,7 @@ REPORT = Path("shell/report")
 
 _RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
 _ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
-_THERE = 0.5  # share of the SfM points near a shell, from which it is not elsewhere, whatever its size
+_THERE = 0.5  # share of the SfM points near a shell, from which it is not elsewhere, however wide it is
 _LOCAL = 10_000  # metres from the origin, within which a shell is not in a coordinate reference system
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
@@ -327,7 +327,8 @@ def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], poin
     shell = transformed(mesh.vertices, alignment.shell_to_scene)
     up = alignment.rotation @ usual_up(alignment.shells)
     words = apart(shell, seen) or heights_apart(shell, points.positions, up, alignment.metres_per_unit)
-    return words if words and _share_on(mesh, alignment, points) < _THERE else None  # a city may be so large
+    too_high = apart((shell @ up)[:, None], (seen @ up)[:, None])  # of another unit; a city is wide, but not so high
+    return words if words and (too_high or _share_on(mesh, alignment, points) < _THERE) else None
 
 
 def _share_on(mesh: ShellMesh, alignment: Alignment, points: SparsePoints) -> float:

@@ -18,6 +18,7 @@ from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.validation import validate
 from shellgs_method.shell import Alignment, ShellMesh
 from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 
 
 def in_its_own_frame(points: SparsePoints) -> tuple[Placement, np.ndarray]:
@@ -41,6 +42,15 @@ def test_a_building_that_stands_where_points_show_it_is_not_misplaced_with_all_o
     assert misplaced(Placement(shifted()), ShellMesh(city, faces), views, points) is None
     elsewhere = misplaced(Placement(shifted(up=20.0)), ShellMesh(city, faces), views, points)
     assert "look for another unit" in (elsewhere or "")
+
+
+@pytest.mark.parametrize("units_per_metre", [1000.0, 1 / 0.0254])
+def test_a_shell_of_another_unit_is_misplaced_though_its_corner_is_in_its_place(mesh, views, points, units_per_metre):
+    """A facade a thousand times as large is a plane near all points."""
+    building = transformed(mesh.vertices, np.linalg.inv(SHELL_FROM_BUILDING))
+    shell = ShellMesh(units_per_metre * building, mesh.faces)
+    words = misplaced(Placement(Alignment(SCENE_FROM_BUILDING, ("s.ply",))), shell, views, points)
+    assert "look for another unit" in (words or "")
 
 
 def test_points_beyond_the_last_gate_by_rounding_count(surface, points, survey_from_scene):
