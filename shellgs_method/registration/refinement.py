@@ -132,10 +132,11 @@ def _held(motion: np.ndarray, evidence: Evidence) -> np.ndarray:
     """A motion without its part along directions that the points do not determine: those beyond the last limit did."""
     scale = scale_of(motion)
     turn = Rotation.from_matrix(motion[:3, :3] / scale).as_rotvec()
-    shift = transformed(evidence.centre[None], motion)[0] - evidence.centre
+    centre = transformed(evidence.centre[None], np.linalg.inv(motion))[0]
+    shift = evidence.centre - centre
     update = np.concatenate([shift, evidence.radius * turn, [evidence.radius * np.log(scale)]])
     weak = evidence.directions[evidence.weak]
-    return similarity_by(update - weak.T @ (weak @ update), evidence.centre, evidence.radius)
+    return similarity_by(update - weak.T @ (weak @ update), centre, evidence.radius)
 
 
 def _solve(
