@@ -24,6 +24,7 @@ REACH = 10.0
 buildings, signals are reflected."""
 _WALK = 50.0  # metres, within which photographs of a building were taken that have the same geo-tag
 _SPOT = 1.0  # metres, within which tags are on one spot
+_SHARED = 0.25  # of the cameras' spread, up to which those with the same tag may be apart
 _LEAST = 3
 _SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 
@@ -70,18 +71,22 @@ class GeoTags:
             up: up direction of the scene.
         """
         level = self.cameras - np.outer(self.cameras @ up, up) / (up @ up)
-        there, here = (np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)) for p in (self.places, level))
+        there, here = _spread(self.places), _spread(level)
         reach = _WALK if self.repeated else REACH
         return max(there - reach, 0.0) / max(here, 1e-12), (there + reach) / max(here, 1e-12)
 
     @property
     def repeated(self) -> bool:
-        """Whether most photographs have the place of another, or all about the same one: then they tell no scale.
+        """Whether tags of photographs far apart are the same, or all are on about one spot: then they tell no scale.
 
-        Without a signal, phones repeat the last place they knew.
+        Without a signal, phones repeat the last place they knew; the cameras of a rig, and frames of a second, share
+        theirs rightly.
         """
-        spread = np.median(np.linalg.norm(self.places - np.median(self.places, axis=0), axis=1))
-        return bool(2 * len(np.unique(self.places, axis=0)) < len(self.places) or spread < _SPOT)
+        _, tag, count = np.unique(self.places, axis=0, return_inverse=True, return_counts=True)
+        total = np.zeros((len(count), 3))
+        np.add.at(total, tag.ravel(), self.cameras)
+        within = np.linalg.norm(self.cameras - (total / count[:, None])[tag.ravel()], axis=1)
+        return bool(np.median(within) > _SHARED * _spread(self.cameras) or _spread(self.places) < _SPOT)
 
     def shift(self, similarity: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 2"]:
         """The shift, in metres to the east and north, that takes cameras to their geo-tags in the median.
@@ -104,6 +109,11 @@ class GeoTags:
         """Median distance, on the ground, of cameras from their geo-tags under an alignment, in metres."""
         placed = transformed(self.cameras, survey_from_scene)[:, :2]
         return float(np.median(np.linalg.norm(placed - self.places, axis=1)))
+
+
+def _spread(places: Float64[np.ndarray, "N D"]) -> float:
+    """Median distance from the middle."""
+    return float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
 
 
 def has_geo_tags(views: Sequence[View]) -> bool:

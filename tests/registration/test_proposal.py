@@ -339,6 +339,15 @@ def test_geo_tags_on_one_spot_tell_no_scale():
     assert least < 0.5 < greatest
 
 
+@pytest.mark.parametrize(("of_one_place", "repeated"), [(5, False), (50, True)])
+def test_geo_tags_that_the_cameras_of_a_rig_share_are_not_repeated(of_one_place: int, repeated: bool):
+    """Five cameras at each of 20 places along 60 m; a phone has two places for all."""
+    tags = walked(noise=2.0)
+    last = np.arange(100) // of_one_place * of_one_place // 5
+    rig = np.random.default_rng(1).normal(np.repeat(tags.cameras, 5, axis=0), 0.2)
+    assert GeoTags(rig, tags.places[last]).repeated is repeated
+
+
 def test_orientations_and_scales_under_which_geo_tags_scatter_are_not_tried():
     tags, random = walked(noise=3.0), np.random.default_rng(0)
     wall = random.uniform(0, [20, 0.1, 8], (2000, 3))
