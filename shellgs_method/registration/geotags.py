@@ -88,6 +88,12 @@ class GeoTags:
         within = np.linalg.norm(self.cameras - (total / count[:, None])[tag.ravel()], axis=1)
         return bool(np.median(within) > _SHARED * _spread(self.cameras) or _spread(self.places) < _SPOT)
 
+    @property
+    def fresh(self) -> GeoTags:
+        """The first photograph of each place: later ones may have been taken after the signal was lost."""
+        first = np.sort(np.unique(self.places, axis=0, return_index=True)[1])
+        return self if self.repeated else GeoTags(self.cameras[first], self.places[first])
+
     def shift(self, similarity: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 2"]:
         """The shift, in metres to the east and north, that takes cameras to their geo-tags in the median.
 

@@ -136,6 +136,7 @@ def _near(tags: GeoTags, surface: Triangles, seen: _Seen) -> list[Candidate]:
 
     Of those that fit well, only ones about as near as the nearest are left: all tags may have a common bias.
     """
+    tags = tags.fresh
     scales = tags.scales(seen.axes[1])
     away = np.linalg.norm(seen.sight.points - np.median(tags.cameras, axis=0), axis=1)
     reach = _NEAR + scales[1] * np.percentile(away, 95)

@@ -348,6 +348,20 @@ def test_geo_tags_that_the_cameras_of_a_rig_share_are_not_repeated(of_one_place:
     assert GeoTags(rig, tags.places[last]).repeated is repeated
 
 
+def test_photographs_after_the_signal_was_lost_do_not_bound_the_search(surface, views, points, monkeypatch):
+    tags = walked()
+    tags.places[11:] = tags.places[11]
+    least, greatest = tags.fresh.scales(np.array([0.0, 0, 1]))
+    assert least < 0.5 < greatest
+    searched = []
+    monkeypatch.setattr(proposal, "shell_axes", lambda *_, **__: [])
+    monkeypatch.setattr(proposal._Search, "scatter", lambda search, _: searched.append(search.tags))
+    seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
+    tags = replace(tags, places=tags.places + surface.vertices[0, :2])
+    assert proposal._near(tags, surface, seen) == []
+    assert len(searched[0].places) == 12
+
+
 def test_orientations_and_scales_under_which_geo_tags_scatter_are_not_tried():
     tags, random = walked(noise=3.0), np.random.default_rng(0)
     wall = random.uniform(0, [20, 0.1, 8], (2000, 3))
