@@ -117,7 +117,7 @@ def _world(
     log: Callable[[str], None],
 ) -> tuple[dict, list[Chapter]]:
     """Write the files of :func:`simulate`."""
-    _refuse_twice(configs)  # before hours of work, too
+    _refuse_twice(configs)  # before hours of work
     names: list[str] = []
     chapters, home = [], None
     for config in configs:
