@@ -261,7 +261,7 @@ class FacadePipeline(VanillaPipeline):
             SceneError: the state does not fit the checkpoint's Gaussians and views.
         """
         state, self._training_state = self._training_state, {}
-        if not state.keys() - {"cameras"}:  # a merged run was not trained itself
+        if not state.keys() - {"cameras", "maps"}:  # a merged run was not trained itself
             return
         if (block := state.get("block", {})) != dict(self._block):
             raise SceneError(

@@ -90,7 +90,7 @@ class BlockRun:
             SceneError: it was trained with other cameras, in another cell, or from another coarse run.
         """
         state = load_checkpoint(self.checkpoint)["pipeline"]
-        extra = state.pop("_extra_state", {})
+        extra = state.get("_extra_state", {})
         block = extra.get("block", {})
         if changed := BoundCameras.from_json(extra.get("cameras", {})).changed(views):
             raise SceneError(
@@ -154,7 +154,8 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     for name in parts[0]:
         key = SURFACE if name == "surface" else f"{GAUSSIANS}{name}"
         state[key] = torch.cat([part[name] for part in parts])
-    state["_extra_state"] = {"cameras": BoundCameras.of(parsed.metadata["views"]).to_json()}
+    maps = state["_extra_state"].get("maps", {})
+    state["_extra_state"] = {"cameras": BoundCameras.of(parsed.metadata["views"]).to_json(), "maps": maps}
     _write(first, state, output)
     return output / "config.yml"
 

@@ -99,9 +99,14 @@ def test_a_merged_run_has_of_each_block_its_core_and_of_the_coarse_run_what_is_f
     assert merged.model.surroundings is None
 
 
-def test_a_merge_leaves_nothing_of_one_before_it_and_overwrites_no_trained_run(configs, coarse, tmp_path):
+def test_a_merge_says_what_its_maps_were_of_and_leaves_nothing_of_one_before_it_nor_overwrites_a_trained_run(
+    configs, coarse, tmp_path
+):
     folder = merge(configs, tmp_path / "merged").parent
     (checkpoint,) = folder.rglob("*.ckpt")
+    of_block = find_checkpoint(configs[0].parent / "nerfstudio_models")
+    maps = [load_checkpoint(path)["pipeline"]["_extra_state"]["maps"] for path in (checkpoint, of_block)]
+    assert maps[0] == maps[1] != {}
     shutil.copyfile(checkpoint, checkpoint.with_name("step-000099999.ckpt"))
     (folder / "seams.json").touch()
     merge(configs, folder)
