@@ -102,15 +102,6 @@ class GeoTags:
         """
         return np.median(self.places - (self.cameras @ similarity.T)[:, :2], axis=0)
 
-    def scatter(self, similarity: Float64[np.ndarray, "3 3"]) -> float:
-        """Median distance, on the ground, of cameras from their geo-tags without the shift of all, in metres.
-
-        Args:
-            similarity: rotation from the scene to the shell's frame, times the scale.
-        """
-        placed = (self.cameras @ similarity.T)[:, :2] + self.shift(similarity)
-        return float(np.median(np.linalg.norm(placed - self.places, axis=1)))
-
     def apart(self, survey_from_scene: Float64[np.ndarray, "4 4"]) -> float:
         """Median distance, on the ground, of cameras from their geo-tags under an alignment, in metres."""
         placed = transformed(self.cameras, survey_from_scene)[:, :2]

@@ -200,25 +200,11 @@ class _Search:
 
     def starts(self, shell_axes: Sequence[np.ndarray], scene_axes: np.ndarray) -> list[Candidate]:
         """The best candidates of all orientations: those that turn the scene's axes to some of the shell's."""
-        turns = [to.T @ scene_axes for to in shell_axes]
-        scatter = self.scatter(turns)
-        return [
-            start for turn in track(turns, "Trying orientations", len(turns)) for start in self.placed(turn, scatter)
-        ]
+        turns = track([to.T @ scene_axes for to in shell_axes], "Trying orientations", len(shell_axes))
+        return [start for turn in turns for start in self.placed(turn)]
 
-    def scatter(self, turns: Sequence[np.ndarray]) -> float:
-        """Greatest scatter of geo-tags about cameras: twice the least of all orientations and scales."""
-        if self.tags is None or self.tags.repeated:
-            return np.inf
-        scales = self.scales[1] * _SCALE_STEP ** -np.arange(40)
-        least = min((self.tags.scatter(scale * turn) for turn in turns for scale in scales), default=0.0)
-        return max(2 * least, REACH / 2)
-
-    def placed(self, turn: np.ndarray, scatter: float = np.inf) -> Iterator[Candidate]:
-        """The best candidates of an orientation: the rotation from the scene's axes to the survey's.
-
-        Of scales under which geo-tags scatter less than that.
-        """
+    def placed(self, turn: np.ndarray) -> Iterator[Candidate]:
+        """The best candidates of an orientation: the rotation from the scene's axes to the survey's."""
         points, empty = self.points @ turn.T, self.empty @ turn.T
         boxes = [np.percentile(each, [3, 97], axis=0) for each in (self.samples, points)]
         extent = np.maximum(np.ptp(boxes[0], axis=0), 0.1 * self.cell)  # a shell may be one flat wall
@@ -232,8 +218,6 @@ class _Search:
         soft = np.maximum(shell, uniform_filter(shell, 3) * 3).clip(max=1.0)
         spectra: dict[tuple[int, ...], np.ndarray] = {}
         for scale in highest * _SCALE_STEP ** -np.arange(steps):
-            if self.tags is not None and self.tags.scatter(scale * turn) > scatter:
-                continue
             placed, passed = scale * points, scale * empty
             low, high = (np.floor(each / self.cell).astype(int) for each in (placed.min(0), placed.max(0)))
             size = high - low + 1

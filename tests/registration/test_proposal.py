@@ -355,21 +355,8 @@ def test_photographs_after_the_signal_was_lost_do_not_bound_the_search(surface, 
     assert least < 0.5 < greatest
     searched = []
     monkeypatch.setattr(proposal, "shell_axes", lambda *_, **__: [])
-    monkeypatch.setattr(proposal._Search, "scatter", lambda search, _: searched.append(search.tags))
+    monkeypatch.setattr(proposal._Search, "starts", lambda search, *_: searched.append(search.tags) or [])
     seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
     tags = replace(tags, places=tags.places + surface.vertices[0, :2])
     assert proposal._near(tags, surface, seen) == []
     assert len(searched[0].places) == 12
-
-
-def test_orientations_and_scales_under_which_geo_tags_scatter_are_not_tried():
-    tags, random = walked(noise=3.0), np.random.default_rng(0)
-    wall = random.uniform(0, [20, 0.1, 8], (2000, 3))
-    sight: Any = SimpleNamespace(points=2 * wall, origins=2 * wall - [0.0, 16.0, 0.0])
-    search = proposal._Search.of(wall, proposal._Seen(2 * wall, sight, np.eye(3)), tags.scales(np.eye(3)[2]), tags)
-    ahead, around = np.eye(3), np.diag([-1.0, -1.0, 1.0])
-    scatter = search.scatter([ahead, around])
-    assert not list(search.placed(around, scatter))
-    scales = [scale_of(found.survey_from_scene) for found in search.placed(ahead, scatter)]
-    assert 0.2 < min(scales) < 0.5 < max(scales) < 0.9
-    assert replace(search, tags=walked(spot=True)).scatter([ahead, around]) == np.inf
