@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import viser
+import viser.transforms
 from jaxtyping import Float, Float64
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from shellgs_method.errors import notice
@@ -39,7 +39,7 @@ class StartAtCamera(ViewerControl):
         axes = self._camera_to_world[:, :3] * (1, -1, -1)  # of viser's cameras: OpenCV
         with client.atomic():
             client.camera.position = self._camera_to_world[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
-            client.camera.wxyz = Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]]
+            client.camera.wxyz = viser.transforms.SO3.from_matrix(axes).wxyz
 
 
 class ContradictedShell(ViewerControl):
