@@ -15,7 +15,8 @@ from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.pixels import kept_pixels
 from shellgs_method.export.frame import Frame
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.files.splats import DEGREE_0, Splats
+from shellgs_method.files.readers.ply import DEGREE_0
+from shellgs_method.files.splats import Splats
 from shellgs_method.gaussians.pruning import contributions
 from shellgs_method.gaussians.seeds import photograph_of
 from shellgs_method.geometry.nearest import point_tree

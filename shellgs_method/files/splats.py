@@ -17,11 +17,10 @@ from torch import Tensor
 
 from shellgs_method.errors import SceneError, check_output, notice
 from shellgs_method.files.atomic import write_whole
+from shellgs_method.files.readers.ply import DEGREE_0
 from shellgs_method.files.splats_page import splats_page
 from shellgs_method.geometry.camera import Camera
 
-DEGREE_0 = 0.5 / math.sqrt(math.pi)
-"""The spherical harmonic of degree 0."""
 FORMATS: tuple[str, ...] = (".ply", ".glb", ".spz", ".html")
 Y_UP = (".glb", ".spz", ".html")
 """Formats whose y axis points up, whatever the scene's does."""

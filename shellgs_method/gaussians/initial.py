@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.splats import DEGREE_0
+from shellgs_method.files.readers.ply import DEGREE_0
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.render.maps import DISC_LOG_THICKNESS, Primitive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterator
 from pathlib import Path
 
@@ -19,8 +20,9 @@ from shellgs_method.files.readers.contents import (
     strip_triangles,
 )
 from shellgs_method.files.readers.points import PIECE, Colours, Points
-from shellgs_method.files.splats import DEGREE_0
 
+DEGREE_0 = 0.5 / math.sqrt(math.pi)
+"""The spherical harmonic of degree 0, by which splats' mean colours are divided."""
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
 _NORMAL = ("nx", "ny", "nz")
