@@ -142,6 +142,8 @@ def place_as_before(path: Path, scene: Path, views: Sequence[View]) -> Placement
         history.append(f"It was found for other cameras than these: {changed}.")
     if file := alignment.changed_file(scene):
         history.append(f"{file} has changed since it was aligned.")
+    if history:
+        alignment = replace(alignment, metrics={})
     return Placement(alignment, history)
 
 
@@ -360,9 +362,11 @@ def refined(
     _, triangle = surface.samples(5000)
     axes = facade_axes(surface.normals[triangle], start[:3, :3] @ likely_up(view.camera for view in views))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
+    if result.moved > reach:
+        sentence += f" That is farther than the {reach:g} m that it may be off: look whether the edges still fit."
     if words := result.evidence.in_words(axes):
         sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."
     matrix = np.linalg.inv(result.survey_from_scene) @ surface.survey_from_shell
-    moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined")
+    moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined", metrics={})
     again = measured_again(placement.correspondences, moved)
     return placement.then(sentence, alignment=moved, correspondences=again)

@@ -21,6 +21,7 @@ from shellgs_method.geometry.precision import COARSEST, FINE, REMEDY, Step, came
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment
 from shellgs_method.registration.correspondences import LEFT_HANDED, Correspondence
+from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.registration.refinement import Refinement, refine
 from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, mirrored_fit, scan_shifts
 from shellgs_method.registration.support import NEAR, OCCLUDING, ViewSupport, look
@@ -61,11 +62,12 @@ LIMITS = {
     "bias": Limit(
         0.025, 0.15, "5 cm along the normal is 3 times the scatter; sills and frames shift the median by 1 cm"
     ),
-    "pull": Limit(
-        0.03,
-        0.25,
-        "the shell is offset from the SfM points: --refine moves it onto them; leave it where picks with small "
-        "residuals placed it, which are more accurate than points on frames and sills that it lacks",
+    "pull": Limit(0.03, 0.25, "the shell is offset from the SfM points: --refine moves it onto them"),
+    "picks": Limit(
+        0.10,
+        0.50,
+        "picks that agree on where the shell is place it more accurately than SfM points on what it lacks: leave "
+        "--refine out",
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
@@ -81,6 +83,8 @@ LIMITS = {
 }
 """All thresholds of the verdict, with their reasons."""
 
+PICKS = "picks_m"
+"""The metric of the picks' median residual, now or in a fit without each, whichever is larger."""
 LIKELIER = "likelier_metres_per_shell_unit"
 """The metric of a unit that is more likely than the shell's own."""
 
@@ -167,6 +171,25 @@ class Validation:
         return float(np.median(close)) if len(close) else float("nan")
 
     @property
+    def picks(self) -> tuple[float, float]:
+        """Median residuals in metres of the picks that are fitted, now and in a fit without each; NaN if unknown.
+
+        Where they are known from an earlier validation only, the shell is where they placed it.
+        """
+        picks = [point for point in self.correspondences if isinstance(point, PickedPoint) and point.is_used]
+        both = [(point.residual, point.left_out_residual) for point in picks]
+        if both:
+            now, without = np.median(both, axis=0)
+            return float(now), float(without)
+        before = self.alignment.metrics.get(PICKS)
+        return (np.nan, np.nan) if before is None else (before, before)
+
+    @property
+    def fits_picks(self) -> bool:
+        """Whether the shell is where picks that agree with each other placed it."""
+        return bool(np.max(self.picks) <= LIMITS["check"].good)
+
+    @property
     def check_points(self) -> float:
         """Median residual of the check points in metres; NaN if there are none."""
         residuals = [point.residual for point in self.correspondences if point.held_out]
@@ -180,8 +203,9 @@ class Validation:
             values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
         values["rounding_m"] = rounding_of(self.steps)
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
-        if not np.isnan(self.check_points):
-            values["check_points_m"] = self.check_points
+        for name, value in (("check_points_m", self.check_points), (PICKS, float(np.max(self.picks)))):
+            if not np.isnan(value):
+                values[name] = value
         if self.likelier is not None:
             values[LIKELIER] = self.likelier
         return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
@@ -295,7 +319,9 @@ def _checks(measured: Validation) -> Iterator[Check]:
     if measured.test is not None:
         evidence = measured.test.evidence
         if not measured.alignment.model:  # adjusted cameras fit picks and weighted tracks better than points alone tell
-            yield check_of("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
+            check = check_of("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
+            is_proved = measured.fits_picks and check.verdict != "good"
+            yield replace(check, verdict="doubtful", why=LIMITS["picks"].why) if is_proved else check
         words = "; ".join(evidence.in_words(measured.axes))
         name = "Directions the points do not determine"
         yield check_of("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
@@ -304,6 +330,9 @@ def _checks(measured: Validation) -> Iterator[Check]:
         yield check_of("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
     if measured.mirrored is not None:
         yield check_of("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
+    now, without = measured.picks
+    if now > without:
+        yield check_of("picks", now - without, "Picks, median residual, minus that in a fit without each", "{:.3f} m")
     if not np.isnan(measured.check_points):
         yield check_of("check", measured.check_points, "Check points, median residual", "{:.3f} m")
 

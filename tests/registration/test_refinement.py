@@ -37,6 +37,12 @@ def test_refinement_does_not_follow_points_in_single_precision(mesh, views, poin
     assert "Refined" in refined(placement, mesh, views, SparsePoints(exact), 0.3).history[-1]
 
 
+def test_a_refinement_says_that_it_went_farther_than_it_was_to(mesh, views, points):
+    for reach, is_farther in ((0.1, False), (0.03, True)):
+        (said,) = refined(Placement(shifted(out=-0.04)), mesh, views, points, reach).history
+        assert (f"farther than the {reach:g} m" in said) == is_farther, said
+
+
 def test_a_building_that_stands_where_points_show_it_is_not_misplaced_with_all_of_its_city(mesh, views, points):
     city = np.concatenate([mesh.vertices + np.array([far, far, 0.0]) for far in (0, -600, 600)])
     faces = np.concatenate([mesh.faces + k * len(mesh.vertices) for k in range(3)])

@@ -9,6 +9,7 @@ import pytest
 from alignments import TRUTH, shifted
 
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.registration.repetition import mirrored_fit
 from shellgs_method.registration.validation import LIMITS, Limit, validate
 from shellgs_method.shell import Alignment, ShellMesh
@@ -90,3 +91,26 @@ def test_the_bias_is_the_distance_of_the_wall(mesh, views, points):
     # The shell is 5 cm deeper: wall points are 5 cm in front of it, points of reveals and undersides of slabs on it.
     assert 0.03 < validate(mesh, shifted(out=-0.05), views, points).bias < 0.05
     assert validate(mesh, shifted(), views, points).bias == pytest.approx(0.0, abs=0.003)
+
+
+def picked(residual: float, without: float) -> list[PickedPoint]:
+    one = PickedPoint("p", np.zeros(3), np.zeros(3), False, True, residual, without, 1.0, "a.png", True, ("a.png",))
+    return 5 * [one]
+
+
+def test_where_picks_agree_a_motion_to_the_points_does_not_refuse_the_shell_and_leaving_them_does(mesh, views, points):
+    aside = shifted(right=0.29)
+
+    def verdicts(alignment, *picks):
+        checks = validate(mesh, alignment, views, points, *picks).checks
+        return {key: c.verdict for c in checks for key in ("Motion", "Picks") if c.name.startswith(key)}
+
+    assert verdicts(aside) == {"Motion": "refused"}
+    assert verdicts(aside, picked(0.04, 0.06)) == {"Motion": "doubtful"}
+    assert verdicts(aside, picked(0.4, 0.06)) == {"Motion": "refused", "Picks": "doubtful"}
+    assert verdicts(shifted(), picked(0.7, 0.06)) == {"Motion": "good", "Picks": "refused"}
+    assert verdicts(aside, picked(0.0, np.nan)) == {"Motion": "refused"}  # three picks always agree
+    measured = validate(mesh, aside, views, points, picked(0.04, 0.06))
+    again = replace(aside, metrics=measured.metrics())
+    assert verdicts(again) == {"Motion": "doubtful"}
+    assert validate(mesh, again, views, points).metrics() == measured.metrics()
