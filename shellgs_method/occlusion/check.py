@@ -104,12 +104,16 @@ def check_views(
     """
     start = time.monotonic()
     shell = CueMaps.open(scene, "shell")
+    files = {
+        source: known
+        for source, known in shell.manifest.sources.items()
+        if Path(source).is_absolute() or (scene / source).exists()
+    }
     maps = CueMaps.create(
         scene,
         "checked",
         command=shell.manifest.command,
-        sources=[path for source in shell.manifest.sources if (path := scene / source).exists()],
-        revisions={COMPARED: _digest(views, held_out), "check": str(VERSION)},
+        revisions=files | {COMPARED: _digest(views, held_out), "check": str(VERSION)},
         metres_per_unit=shell.manifest.metres_per_unit,
         max_image_size=shell.manifest.max_image_size,
     )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,6 +28,8 @@ from shellgs_method.geometry.similarity import affine, scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.loading import load_shell
 from shellgs_method.shell.mesh import ShellMesh
+
+_TAIL = 3  # last parts of a path, by which a file is looked for in a project that was moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +100,8 @@ class Alignment:
         return ", ".join(path.name if path.is_absolute() else str(path) for path in map(Path, self.shells))
 
     def files(self, scene: Path) -> list[Path]:
-        """The shell's files."""
-        return [scene / shell for shell in self.shells]
+        """The shell's files, also where they were moved together with the scene."""
+        return [_file(scene, shell, known) for shell, known in zip_longest(self.shells, self.hashes)]
 
     @property
     def scale(self) -> float:
@@ -288,6 +292,16 @@ class Alignment:
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),
         }
+
+
+def _file(scene: Path, shell: str, known: str | None) -> Path:
+    """A file of a shell; if one outside the scene is gone, that of the same contents in a folder above the scene."""
+    path = scene / shell
+    if not known or not Path(shell).is_absolute() or os.path.exists(path):
+        return path
+    names = [Path(*path.parts[1:][-parts:]) for parts in range(1, _TAIL + 1)]
+    candidates = (above / name for above in scene.resolve().parents for name in names)
+    return next((found for found in candidates if os.path.isfile(found) and content_hash(found) == known), path)
 
 
 def _strings(value: str | Sequence[object]) -> tuple[str, ...]:

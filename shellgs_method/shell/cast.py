@@ -133,13 +133,17 @@ def cast_views(
     revisions = {"mesher": f"{recorded.mesher} {VERSION}"} if meshing else {}
     if compared:  # what they found is cut out of the truth
         revisions["findings"] = fingerprint(compared[0].manifest.sources)
+    files = dict(zip(recorded.shells, recorded.files(scene), strict=True))
+    # One outside the scene has the name that it was aligned by, also where it was moved together with the scene.
+    outside = {name: source_hash(file) for name, file in files.items() if Path(name).is_absolute()}
+    inside = [file for name, file in files.items() if name not in outside]
     (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,
         kind,
         command=_command(max_image_size, recorded if meshing else None) + flags,
-        sources=[*recorded.files(scene), path, *_followed(scene, recorded, kind), *_mask_sources(scene, views)],
-        revisions=revisions,
+        sources=[*inside, path, *_followed(scene, recorded, kind), *_mask_sources(scene, views)],
+        revisions=revisions | outside,
         metres_per_unit=recorded.metres_per_unit,
         max_image_size=max_image_size,
         error=recorded.error,

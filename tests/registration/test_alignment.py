@@ -273,6 +273,22 @@ def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shel
     assert "views cast" in shellgs("cast", scene)
 
 
+def test_a_project_that_was_moved_keeps_its_shell_and_its_maps(scene, shellgs, tmp_path):
+    shells, known = {name: tmp_path / name / "scans/facade.ply" for name in "ab"}, Alignment.load(scene / ALIGNMENT)
+    shells["a"].parent.mkdir(parents=True)
+    (scene / known.shells[0]).rename(shells["a"])
+    scene = scene.rename(tmp_path / "a/scene")
+    replace(known, shells=(str(shells["a"]),)).record(scene / ALIGNMENT, views_of(scene))
+    assert "10 views cast" in shellgs("cast", scene)
+    made = [CueMaps.open(scene, kind).manifest for kind in ("shell", "checked")]
+    scene = (tmp_path / "a").rename(tmp_path / "b") / "scene"
+    assert Alignment.load(scene / ALIGNMENT).files(scene) == [shells["b"]]
+    assert "0 views cast, 10 already there" in shellgs("cast", scene)
+    assert [CueMaps.open(scene, kind).manifest for kind in ("shell", "checked")] == made
+    shells["b"].write_text("another scan")
+    assert Alignment.load(scene / ALIGNMENT).files(scene) == [shells["a"]]
+
+
 def test_an_alignment_of_an_older_version_knows_no_hashes_and_is_used(scene):
     with edited(scene / ALIGNMENT) as fields:
         del fields["hashes"]
