@@ -199,7 +199,7 @@ def align(scene: Scene, config: Annotated[AlignConfig, tyro.conf.arg(name="")] =
             config.shell or placement.alignment.files(scene),
             config.metres_per_shell_unit,
             config.crs,
-            refined=bool(config.refine or misplacement or placement.proposed or validation.fits_picks),
+            refined=bool(config.refine or misplacement or placement.proposed or validation.contradicts_picks),
             picked=bool(config.picks),
         )
         raise RefusedError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}; {advice}")

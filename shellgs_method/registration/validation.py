@@ -62,7 +62,12 @@ LIMITS = {
     "bias": Limit(
         0.025, 0.15, "5 cm along the normal is 3 times the scatter; sills and frames shift the median by 1 cm"
     ),
-    "pull": Limit(0.03, 0.25, "the shell is offset from the SfM points: --refine moves it onto them"),
+    "pull": Limit(
+        0.03,
+        0.25,
+        "the shell is offset from the SfM points: --refine moves it onto them; leave it where picks with small "
+        "residuals placed it, which are more accurate than points on frames and sills that it lacks",
+    ),
     "picks": Limit(
         0.10,
         0.50,
@@ -83,8 +88,8 @@ LIMITS = {
 }
 """All thresholds of the verdict, with their reasons."""
 
-PICKS = "picks_m"
-"""The metric of the picks' median residual, now or in a fit without each, whichever is larger."""
+OFF_PICKS = "pull_off_picks_m"
+"""The metric of the motion that would fit the points better, at picks that agree on where the shell is."""
 LIKELIER = "likelier_metres_per_shell_unit"
 """The metric of a unit that is more likely than the shell's own."""
 
@@ -172,22 +177,34 @@ class Validation:
 
     @property
     def picks(self) -> tuple[float, float]:
-        """Median residuals in metres of the picks that are fitted, now and in a fit without each; NaN if unknown.
-
-        Where they are known from an earlier validation only, the shell is where they placed it.
-        """
-        picks = [point for point in self.correspondences if isinstance(point, PickedPoint) and point.is_used]
-        both = [(point.residual, point.left_out_residual) for point in picks]
-        if both:
-            now, without = np.median(both, axis=0)
-            return float(now), float(without)
-        before = self.alignment.metrics.get(PICKS)
-        return (np.nan, np.nan) if before is None else (before, before)
+        """Median residuals in metres of the picks that are fitted, now and in a fit without each; NaN if unknown."""
+        both = [(point.residual, point.left_out_residual) for point in self._picks]
+        now, without = np.median(both, axis=0) if both else (np.nan, np.nan)
+        return float(now), float(without)
 
     @property
-    def fits_picks(self) -> bool:
-        """Whether the shell is where picks that agree with each other placed it."""
-        return bool(np.max(self.picks) <= LIMITS["check"].good)
+    def off_picks(self) -> float:
+        """Metres by which the test refinement takes the shell off picks that agree on where it is; NaN if unknown.
+
+        Without picks, it is what was measured when they placed the shell.
+        """
+        if not self._picks:
+            before = self.alignment.metrics.get(OFF_PICKS)
+            return np.nan if before is None else before
+        if self.test is None or not np.max(self.picks) <= LIMITS["check"].good:
+            return np.nan
+        scene = np.stack([point.scene for point in self._picks])
+        moved = transformed(scene, self.test.survey_from_scene) - transformed(scene, self.survey_from_scene)
+        return float(np.median(np.linalg.norm(moved, axis=1)))
+
+    @property
+    def contradicts_picks(self) -> bool:
+        """Whether the SfM points would take the shell off picks that agree on where it is."""
+        return self.off_picks > LIMITS["picks"].good
+
+    @property
+    def _picks(self) -> list[PickedPoint]:
+        return [point for point in self.correspondences if isinstance(point, PickedPoint) and point.is_used]
 
     @property
     def check_points(self) -> float:
@@ -203,7 +220,7 @@ class Validation:
             values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
         values["rounding_m"] = rounding_of(self.steps)
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
-        for name, value in (("check_points_m", self.check_points), (PICKS, float(np.max(self.picks)))):
+        for name, value in (("check_points_m", self.check_points), (OFF_PICKS, self.off_picks)):
             if not np.isnan(value):
                 values[name] = value
         if self.likelier is not None:
@@ -320,8 +337,8 @@ def _checks(measured: Validation) -> Iterator[Check]:
         evidence = measured.test.evidence
         if not measured.alignment.model:  # adjusted cameras fit picks and weighted tracks better than points alone tell
             check = check_of("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
-            is_proved = measured.fits_picks and check.verdict != "good"
-            yield replace(check, verdict="doubtful", why=LIMITS["picks"].why) if is_proved else check
+            doubted = replace(check, verdict="doubtful", why=LIMITS["picks"].why)
+            yield doubted if measured.contradicts_picks and check.verdict != "good" else check
         words = "; ".join(evidence.in_words(measured.axes))
         name = "Directions the points do not determine"
         yield check_of("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())

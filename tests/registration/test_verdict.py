@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from alignments import TRUTH, shifted
+from alignments import AXES, TRUTH, shifted
+from scipy.spatial.transform import Rotation
 
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.picks import PickedPoint
@@ -93,24 +94,27 @@ def test_the_bias_is_the_distance_of_the_wall(mesh, views, points):
     assert validate(mesh, shifted(), views, points).bias == pytest.approx(0.0, abs=0.003)
 
 
-def picked(residual: float, without: float) -> list[PickedPoint]:
-    one = PickedPoint("p", np.zeros(3), np.zeros(3), False, True, residual, without, 1.0, "a.png", True, ("a.png",))
-    return 5 * [one]
+def picked(residual: float, without: float, places: np.ndarray) -> list[PickedPoint]:
+    of = False, True, residual, without, 1.0, "a.png", True, ("a.png",)
+    return [PickedPoint("p", np.zeros(3), place, *of) for place in places]
 
 
 def test_where_picks_agree_a_motion_to_the_points_does_not_refuse_the_shell_and_leaving_them_does(mesh, views, points):
-    aside = shifted(right=0.29)
+    def validated(alignment, *picks):
+        validation = validate(mesh, alignment, views, points, *picks)
+        checks = {key: c.verdict for c in validation.checks for key in ("Motion", "Picks") if c.name.startswith(key)}
+        return checks, validation.metrics()
 
-    def verdicts(alignment, *picks):
-        checks = validate(mesh, alignment, views, points, *picks).checks
-        return {key: c.verdict for c in checks for key in ("Motion", "Picks") if c.name.startswith(key)}
-
-    assert verdicts(aside) == {"Motion": "refused"}
-    assert verdicts(aside, picked(0.04, 0.06)) == {"Motion": "doubtful"}
-    assert verdicts(aside, picked(0.4, 0.06)) == {"Motion": "refused", "Picks": "doubtful"}
-    assert verdicts(shifted(), picked(0.7, 0.06)) == {"Motion": "good", "Picks": "refused"}
-    assert verdicts(aside, picked(0.0, np.nan)) == {"Motion": "refused"}  # three picks always agree
-    measured = validate(mesh, aside, views, points, picked(0.04, 0.06))
-    again = replace(aside, metrics=measured.metrics())
-    assert verdicts(again) == {"Motion": "doubtful"}
-    assert validate(mesh, again, views, points).metrics() == measured.metrics()
+    aside, wall = shifted(right=0.29), points.positions[:5]
+    kept = validated(aside, picked(0.04, 0.06, wall))
+    assert kept[0] == {"Motion": "doubtful"}
+    assert validated(replace(aside, metrics=kept[1])) == kept
+    assert validated(aside, picked(0.4, 0.06, wall))[0] == {"Motion": "refused", "Picks": "doubtful"}
+    assert validated(aside, picked(0.0, np.nan, wall))[0] == {"Motion": "refused"}  # three picks always agree
+    pivot = mesh.vertices[0]  # picks near it say little of the far end
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.radians(1.7) * AXES[:, 2]).as_matrix()
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    corner = np.repeat(transformed(pivot[None], TRUTH), 5, axis=0)
+    turned = Alignment(TRUTH @ turn, ("shell/facade.ply",))
+    assert validated(turned, picked(0.04, 0.06, corner))[0] == {"Motion": "refused"}
