@@ -51,7 +51,8 @@ def turned(axis: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axis", [pytest.param("x", marks=pytest.mark.slow), "none"])
-def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
+def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis, monkeypatch):
+    monkeypatch.setattr(proposal, "_CELLS", 5000)  # three times as fast
     motion = turned(axis)
     askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
     placement = place_by_guess(askew, views, points, unplaced("shell/facade.ply"))
