@@ -74,12 +74,20 @@ def mend_commands() -> None:
 
 
 def _mend_render(render: Any) -> None:
-    """Ns-render checks no camera path that it reads, starts spirals from listed data managers alone, and wants ffmpeg
-    for images, too.
+    """Ns-render checks no camera path that it reads, interpolates between views though there is one, starts spirals
+    from listed data managers alone, and wants ffmpeg for images, too.
     """
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
+    def refuse_one(cameras: Any, *_rest: Any, **_settings: Any) -> None:
+        if len(cameras) < 2:
+            raise SceneError(
+                "ns-render interpolate has one view to interpolate between: name the training photographs by "
+                "--pose-source train, or use ns-render camera-path or spiral"
+            )
+
+    render.get_interpolated_camera_path = _before(render.get_interpolated_camera_path, refuse_one)
     render.json = SimpleNamespace(load=_camera_path)  # it reads nothing else by it
     render.VanillaDataManager = (VanillaDataManager, FullImageDatamanager)
     command = _running((render.RenderCameraPath, render.RenderInterpolated, render.SpiralRender))

@@ -80,6 +80,15 @@ def test_a_path_of_other_cameras_is_rendered(loaded, tmp_path, kind):
     assert image.shape == (16, 32, 3)
 
 
+def test_one_view_is_not_interpolated_but_refused(loaded, trainer, tmp_path, monkeypatch):
+    """A scene of up to eight photographs holds out one."""
+    dataset = SimpleNamespace(cameras=trainer.pipeline.datamanager.eval_dataset.cameras[:1])
+    monkeypatch.setattr(trainer.pipeline.datamanager, "eval_dataset", dataset)
+    with pytest.raises(SystemExit, match=r"^shellgs: ns-render interpolate has one view .*--pose-source train"):
+        render.RenderInterpolated(CONFIG, tmp_path / "out", "png", output_format="images").main()
+    assert not list(tmp_path.iterdir())
+
+
 PATHS: dict[str, tuple[dict[str, Any], str]] = {
     "one keyframe": ({"camera_path": []}, "has a path without cameras: add a second keyframe"),
     "cameras of a scene": ({"camera_path": None, "frames": []}, "is not a camera path.*ns-render dataset"),
