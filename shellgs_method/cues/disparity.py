@@ -10,8 +10,9 @@ from jaxtyping import Float, Float32, Float64
 from scipy.ndimage import map_coordinates
 from scipy.stats import siegelslopes
 
-Values = Literal["disparity", "inverse-depth", "depth"]
-"""Meaning of a map's values, each up to scale; disparity and inverse depth also up to a shift."""
+Values = Literal["disparity", "inverse-depth", "depth", "distance"]
+"""Meaning of a map's values, each up to scale; disparity and inverse depth also up to a shift. Depth is along the
+camera's axis, distance along the pixel's ray."""
 
 # A view's map is trusted if it has enough points, at different depths, and agrees with most of them once aligned.
 MIN_POINTS = 20
@@ -35,6 +36,7 @@ class DisparityFit:
         residual: median depth error |Δz| / z over the points.
         spread: range of the points' disparities (5th to 95th percentile), relative to their median.
         farthest: depth within which 99 % of the inliers lie, in scene units.
+        otherwise: the residual if depths were distances or distances depths; None where they are known.
     """
 
     points: int
@@ -44,6 +46,7 @@ class DisparityFit:
     residual: float = 1.0
     spread: float = 0.0
     farthest: float = 0.0
+    otherwise: float | None = None
 
     @property
     def problem(self) -> str | None:
@@ -68,7 +71,7 @@ def as_disparity(values: Float[np.ndarray, "H W"], meaning: Values) -> Float32[n
     """
     valid = np.isfinite(values) & (values != 0 if meaning == "disparity" else values > 0)
     values = np.where(valid, values, 1).astype(np.float64)
-    return np.where(valid, 1 / values if meaning == "depth" else values, np.nan).astype(np.float32)
+    return np.where(valid, 1 / values if meaning in ("depth", "distance") else values, np.nan).astype(np.float32)
 
 
 def fit_disparity(

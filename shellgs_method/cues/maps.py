@@ -14,7 +14,7 @@ import numpy as np
 from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import content_hash, write_whole
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMaps
@@ -24,6 +24,7 @@ from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.machine.progress import track
 
 NO_PREDICTION = "there is no prediction for it"
+_BETTER = 0.7  # of the residual, in the median over the views: the values of maps are not what they are said to be
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ def make_maps(
             written += 1
         fits.add(view, fit)
     problems = {view.name: problem for view in views if (problem := fits.problem(view.name))}
+    if advice := _misread(predictor, [fit for fit in fits.views.values() if fit]):
+        notice(f"The maps of {predictor.name} fit the SfM points better {advice}.")
     residuals = [fit["residual"] for name, fit in fits.views.items() if fit and name not in problems]
     return MonoSummary(written, skipped, problems, float(np.median(residuals)), time.monotonic() - start)
 
@@ -109,7 +112,10 @@ def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[
     prediction = predictor.predict(view)
     if prediction is None:
         return None, None
-    fit = fit_disparity(prediction.disparity, *points.seen_in(view))
+    pixels, z = points.seen_in(view)
+    fit = fit_disparity(prediction.disparity, pixels, z)
+    if prediction.otherwise is not None:
+        fit = replace(fit, otherwise=fit_disparity(prediction.otherwise, pixels, z).residual)
     if fit.problem:
         return fit, None
     depth = aligned_depth(prediction.disparity, fit)
@@ -124,13 +130,27 @@ def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[
 
 def _check_one_view(views: Sequence[View], points: SparsePoints, predictor: Predictor) -> None:
     """Find one view that gets a map, so that a mistake is reported before existing maps are marked stale."""
-    problem = "there are no views"
+    problem, fits = "there are no views", []
     for view in views:
         fit, cue = align_view(view, points, predictor)
         if cue is not None:
             return
         problem = f"for example {view.name}: {fit.problem if fit else NO_PREDICTION}"
-    raise SceneError(f"no view has a monocular map that can be trusted; {problem}")
+        fits += [asdict(fit)] if fit else []
+    advice = f"; they fit better {advice}" if (advice := _misread(predictor, fits)) else ""
+    raise SceneError(f"no view has a monocular map that can be trusted; {problem}{advice}")
+
+
+def _misread(predictor: Predictor, fits: Sequence[dict]) -> str | None:
+    """As what the values of maps fit the SfM points better than as what they are said to be, in words."""
+    both = [(fit["residual"], fit["otherwise"]) for fit in fits if fit.get("otherwise") is not None]
+    if predictor.values is None or not both:
+        return None
+    residual, otherwise = np.median(both, axis=0)
+    if np.median([other / max(own, 1e-9) for own, other in both]) > _BETTER:
+        return None
+    said, other = predictor.values
+    return f"as {other} than as {said} ({otherwise:.1%} off in the median, not {residual:.1%}): give --values {other}"
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".npy", ".npz", ".png")
 ASPECT_TOLERANCE = 0.02  # networks round sizes to multiples of 14 or 32
+_OTHERWISE = {"depth": "distance", "distance": "depth"}
+"""What values may be that are said to be something else."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class Precomputed:
     # tyro reads these types: they are written out, with Optional for Python 3.10.
     folder: Path
     """Folder of the maps; zero and NaN stand for no value."""
-    values: Literal["disparity", "inverse-depth", "depth"] = "disparity"
-    """Meaning of the maps' values, in any unit: disparity (up to a shift), inverse depth, or z-depth."""
+    values: Literal["disparity", "inverse-depth", "depth", "distance"] = "disparity"
+    """Meaning of the maps' values, in any unit: disparity (up to a shift), inverse depth, z-depth, or distance from the
+    camera along the pixel's ray, as of lidars and some renderers."""
     normals: Optional[Path] = None
     """Folder of normal maps with the same names, as vectors or colours; the same folder if an npz holds both."""
     convention: Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"] = "opencv"
@@ -56,6 +59,7 @@ class Precomputed:
         from shellgs_method.cues.normals import decoded, to_opencv
         from shellgs_method.cues.source import Prediction, Predictor, hash_of
 
+        other = _OTHERWISE.get(self.values)
         maps = MapFolder(self.folder, (self.values.replace("-", "_"), "disparity", "inverse_depth", "depth", "arr_0"))
         normals = None if self.normals is None else MapFolder(self.normals, ("normal", "normals", "arr_0"))
 
@@ -68,12 +72,22 @@ class Precomputed:
             if normal is not None:
                 normal = to_opencv(decoded(normal), self.convention)
                 normal = _in_view(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
-            return Prediction(_in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
+            disparity = _in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0]
+            if not other:
+                return Prediction(disparity, normal)
+            oblique = disparity * view.camera.rays().norm(dim=-1).numpy().astype(np.float32)
+            if self.values == "distance":
+                return Prediction(oblique, normal, disparity)
+            return Prediction(disparity, normal, oblique)
 
         files = [*maps.named, *(normals.named if normals else ())]
         revision = hash_of(files, self.values, self.convention)
         return Predictor(
-            str(self.folder.absolute()), revision, predict, convention=self.convention if normals else None
+            str(self.folder.absolute()),
+            revision,
+            predict,
+            convention=self.convention if normals else None,
+            values=(self.values, other) if other else None,
         )
 
 

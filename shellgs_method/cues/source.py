@@ -24,10 +24,13 @@ class Prediction:
         disparity: disparity, larger where nearer, affine in the inverse depth; NaN where unknown.
         normal: normals in the OpenCV camera frame, of either sign and any length, zero where unknown; None to use
             those of the depth's gradient.
+        otherwise: disparity if depths were distances along the pixels' rays, or the other way round; None if that is
+            known.
     """
 
     disparity: Float32[np.ndarray, "H W"]
     normal: Float[np.ndarray, "H W 3"] | None = None
+    otherwise: Float32[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Predictor:
         predict: function from a view to its prediction; None if there is none.
         licence: licence of the weights, as stated in their model card; None for existing maps.
         convention: declared axes of the normals, to be checked; None if they are known.
+        values: declared meaning of the values and the one that they may have instead; None if it is known.
     """
 
     name: str
@@ -47,6 +51,7 @@ class Predictor:
     predict: Callable[[View], Prediction | None]
     licence: str | None = None
     convention: Convention | None = None
+    values: tuple[str, str] | None = None
 
     @property
     def non_commercial(self) -> bool:

@@ -124,7 +124,8 @@ def test_disparity_is_larger_where_nearer_for_all_stored_values():
     stored = np.array([[2.0, 4.0, 0.0, -1.0, nan, np.inf]])
     np.testing.assert_array_equal(as_disparity(stored, "disparity"), [[2, 4, nan, -1, nan, nan]])
     np.testing.assert_array_equal(as_disparity(stored, "inverse-depth"), [[2, 4, nan, nan, nan, nan]])
-    np.testing.assert_array_equal(as_disparity(stored, "depth"), [[0.5, 0.25, nan, nan, nan, nan]])
+    for values in ("depth", "distance"):
+        np.testing.assert_array_equal(as_disparity(stored, values), [[0.5, 0.25, nan, nan, nan, nan]])
 
 
 # Normals
@@ -621,6 +622,29 @@ def test_wrong_axes_are_refused_with_the_view_and_the_right_ones(scene: Path, tm
     assert sentence.startswith("shellgs: the normals of view 'images/frame_000")
     assert "read as opencv" in sentence
     assert "as opengl" in sentence
+
+
+@pytest.mark.parametrize(("said", "right"), [("depth", "distance"), ("distance", "depth")])
+def test_distances_and_depths_are_told_apart(
+    said: str, right: str, scene: Path, tmp_path: Path, monkeypatch, capsys, caplog
+):
+    write_cloud(scene, exact_points(scene))
+    write_maps(scene, tmp_path / "maps")
+    if right == "distance":
+        for view, cue in truths(scene):
+            oblique = view.camera.rays().norm(dim=-1).numpy()
+            np.savez(tmp_path / "maps" / f"{Path(view.name).stem}.npz", depth=7 * cue.depth * oblique)
+    words = (scene, "from", tmp_path / "maps", "--values")
+    run(monkeypatch, capsys, *words, said)
+    assert f"fit the SfM points better as {right} than as {said} (" in caplog.text
+    caplog.clear()
+    run(monkeypatch, capsys, *words, right)
+    assert "fit the SfM points better" not in caplog.text
+    for view, truth in truths(scene):
+        cue = CueMaps.open(scene, "mono").read(view.name, view.camera)
+        assert cue is not None
+        both = cue.mask & truth.mask
+        np.testing.assert_allclose(cue.depth[both], truth.depth[both], rtol=5e-3)
 
 
 def test_a_second_run_keeps_the_first_ones_maps(scene: Path, tmp_path: Path, monkeypatch, capsys):
