@@ -214,7 +214,8 @@ def sharpest(sharpnesses: Float[np.ndarray, " N"], progress: Float[np.ndarray, "
 @contextmanager
 def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStream]]:
     try:
-        with av.open(str(video)) as container:
+        # Absolute, or FFmpeg takes what is before a colon for a protocol, as in 2024-05-01T12:30:00.mp4.
+        with av.open(str(video.absolute())) as container:
             if container.format.name == "tty":  # FFmpeg draws what is written, as a film
                 raise av.error.InvalidDataError(0, "it is text")
             stream = _main_stream(video, container.streams.video)

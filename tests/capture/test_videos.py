@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.ndimage import shift as translated
 
 from shellgs_method.capture import capture
-from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
+from shellgs_method.capture.frames import extract_frames, first_frame, sharpest, shift, stretches, travelled
 from shellgs_method.capture.photographs import add_photograph
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import read_image
@@ -68,6 +68,17 @@ def test_frames_that_a_video_holds_are_extracted_once_and_this_is_told(tmp_path,
     assert "show.mp4 repeat the frame before" in caplog.text
     assert len(numbers(tmp_path / "slow")) > 3
     assert "slow.mp4" not in caplog.text
+
+
+def test_a_video_named_by_its_time_is_read_from_its_own_folder(tmp_path, monkeypatch):
+    """FFmpeg takes what is before a colon for a protocol."""
+    monkeypatch.chdir(tmp_path)
+    video = Path("2024-05-01T12:30:00.mp4")
+    write_video(tmp_path / "walk.mp4", [photograph(160, 96)] * 3)
+    (tmp_path / "walk.mp4").rename(video)
+    frame = first_frame(video)
+    assert frame is not None
+    assert (frame.width, frame.height) == (160, 96)
 
 
 def test_sharpness_is_relative_to_the_neighbourhood():
