@@ -30,7 +30,7 @@ from shellgs_method.registration.geotags import REACH, GeoTags, has_geo_tags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
-from shellgs_method.registration.refinement import refine
+from shellgs_method.registration.refinement import motion_in_words, refine
 from shellgs_method.registration.support import NEAR
 from shellgs_method.registration.validation import Check, check_of, rounding_of, steps_in_metres
 from shellgs_method.shell.alignment import Alignment
@@ -295,15 +295,21 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
             )
     elif is_far and not unplaced.crs and has_geo_tags(views):
         history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
+    imprecise, elsewhere = ([rival for rival in rivals if rival.is_imprecise == each] for each in (True, False))
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
-        for rival in rivals
+        for rival in elsewhere
         if rival.score >= AMBIGUOUS * best.score
     ]
     checks = [check_of("agreement", best.score, "Agreement with the cameras' sightlines", "{:.0%}")]
-    for rival in rivals[:1]:
+    for rival in elsewhere[:1]:
         name = "Agreement elsewhere, relative to that in place"
         checks.append(check_of("elsewhere", rival.score / best.score, name, "{:.2f}"))
+    if imprecise:
+        farthest = max(imprecise, key=lambda rival: rival.displacement)
+        off, words = farthest.displacement, f"m or more {motion_in_words(farthest.shift)}"
+        history.append(f"Imprecise: by {off:.1f} {words}, along which the shell fits as well; picks of corners fix it.")
+        checks.append(check_of("imprecise", off, "Imprecision of the place", f"{{:.1f}} {words}"))
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = replace(unplaced, shell_to_scene=matrix, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)

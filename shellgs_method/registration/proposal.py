@@ -10,7 +10,7 @@ proposal for the user to check.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -49,6 +49,8 @@ _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
 _DIFFERENT_FROM_AFAR = 0.01
+_ONE_PLACE = 4.0  # metres of displacement, below which two candidates may be the same place
+_STEEP = 0.97  # share of a candidate's score, below which it is another place if the shell fits worse on the way to it
 _NEAR = 3 * REACH  # metres from geo-tags
 
 
@@ -59,12 +61,17 @@ class Candidate:
     Attributes:
         survey_from_scene: similarity.
         score: agreement with the cameras' sightlines; between cells of grids at first.
-        displacement: mean displacement of the shell from the best candidate, in metres.
+        displacement: mean displacement of what is seen of the shell from the best candidate, in metres.
+        shift: mean vector of it in metres: right, up and out of the main wall.
+        is_imprecise: whether this is the place of the best candidate, which is imprecise along a plane wall: the shell
+            fits as well all the way.
     """
 
     survey_from_scene: Float64[np.ndarray, "4 4"]
     score: float
     displacement: float = 0.0
+    shift: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    is_imprecise: bool = False
 
 
 def propose(
@@ -270,16 +277,18 @@ class _Fit:
         points: SfM points, in random order.
         sight: sightlines to them.
         spread: some points of the shell, by which it is seen how far candidates are apart.
+        axes: right, up and out of the main wall in the scene, as rows.
     """
 
     surface: Triangles
     points: np.ndarray
     sight: Sightlines
     spread: np.ndarray
+    axes: np.ndarray
 
     @classmethod
     def of(cls, surface: Triangles, samples: np.ndarray, seen: _Seen) -> _Fit:
-        return cls(surface, np.random.default_rng(0).permutation(seen.points), seen.sight, samples[:200])
+        return cls(surface, np.random.default_rng(0).permutation(seen.points), seen.sight, samples[:200], seen.axes)
 
     def polished(self, starts: Sequence[Candidate], cell: float) -> list[Candidate]:
         """The best candidates, refined ever more finely.
@@ -305,8 +314,7 @@ class _Fit:
     def ranked(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates that differ, the best first, and how far the others are from it."""
         kept = self.distinct(candidates, _POLISHED, self.different(candidates))
-        others = (replace(other, displacement=self.displacement(kept[0], other)) for other in kept[1:])
-        return [*kept[:1], *others]
+        return [*kept[:1], *(self.compared(other, kept[0]) for other in kept[1:])]
 
     def different(self, candidates: Sequence[Candidate]) -> float:
         """Metres from which candidates differ: the farther away the cameras are, the more."""
@@ -353,10 +361,16 @@ class _Fit:
                     break
         return [best[k] for k in kept]
 
-    def displacement(self, one: Candidate, other: Candidate) -> float:
-        """Mean displacement of the shell between two candidates, in metres."""
-        moved = transformed(self.spread, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
-        return float(np.linalg.norm(moved - self.spread, axis=1).mean())
+    def compared(self, other: Candidate, best: Candidate) -> Candidate:
+        """A candidate with how far it is from the best."""
+        points, to, end = self.points[:_MANY], best.survey_from_scene, other.survey_from_scene
+        moved = scale_of(to) * (transformed(points, np.linalg.inv(end) @ to) - points)
+        apart = float(np.linalg.norm(moved, axis=1).mean())
+        # In fifths, since halfway there may be the bay in between. So near, the mean of two similarities is one.
+        way = (to + share * (end - to) for share in (0.2, 0.4, 0.6, 0.8))
+        is_close = apart < _ONE_PLACE and other.score >= AMBIGUOUS * best.score
+        flat = is_close and all(self.measured(each, _FIT).score >= _STEEP * other.score for each in way)
+        return replace(other, displacement=apart, shift=self.axes @ moved.mean(axis=0), is_imprecise=flat)
 
 
 def _most(points: np.ndarray) -> np.ndarray:

@@ -328,6 +328,41 @@ def test_a_candidate_stays_where_refining_it_makes_it_worse(surface, views, poin
     assert found.score > 0.8
 
 
+@pytest.mark.parametrize(
+    ("of_walls", "right", "up", "imprecise"),
+    [(True, 0.2, 0.8, True), (False, 0.0, 0.8, False), (False, 3.0, 0.0, False)],
+)
+def test_a_shift_along_a_bare_wall_is_imprecise_and_one_by_a_bay_is_another_place(
+    mesh, surface, views, points, survey_from_scene, of_walls, right, up, imprecise
+):
+    corners = np.array([[-30.0, 0, -20], [50, 0, -20], [50, 0, 30], [-30, 0, 30]])
+    wall = ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]]))
+    placed = surface.survey_from_shell
+    shell = ShellSurface(wall, 1.0) if of_walls else surface
+    to = shell.survey_from_shell @ np.linalg.inv(placed) @ survey_from_scene
+    move = np.eye(4)
+    move[:3, 3] = -shell.survey_from_shell[:3, :3] @ AXES @ [right, up, 0]
+    seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
+    fit = proposal._Fit.of(shell, shell.samples(500)[0], seen)
+    best, other = (fit.measured(each, proposal._FIT) for each in (to, move @ to))
+    found = fit.compared(replace(other, score=best.score), best)
+    np.testing.assert_allclose(found.shift, [right, up, 0], atol=0.05)
+    assert found.displacement == pytest.approx(np.hypot(right, up), abs=0.05)
+    assert found.is_imprecise == imprecise
+
+
+@pytest.mark.parametrize(("up", "verdict"), [(0.8, "doubtful"), (2.5, "refused")])
+def test_an_imprecise_place_is_told_with_its_direction(
+    mesh, views, points, survey_from_scene, monkeypatch, up, verdict
+):
+    best = Candidate(survey_from_scene, 0.8)
+    rival = Candidate(survey_from_scene, 0.78, up, np.array([0.0, -up, 0.0]), is_imprecise=True)
+    monkeypatch.setattr(align, "propose", lambda *_: [best, rival])
+    placement = place_by_guess(mesh, views, points, unplaced("shell/facade.ply"))
+    assert placement.history[-1].startswith(f"Imprecise: by {up} m or more upwards")
+    assert [check.verdict for check in placement.checks] == ["good", verdict]
+
+
 def walked(noise: float = 0.0, spot: bool = False) -> GeoTags:
     """Geo-tags of a walk of 60 m around a corner, in a scene whose unit is half a metre, by a phone."""
     way = np.array([[min(k, 30.0), max(k - 30.0, 0.0), 0.0] for k in range(0, 60, 3)])
