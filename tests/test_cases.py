@@ -76,9 +76,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
     },
     "08-gcp-in-degrees": {"ordinary.txt": WORKS, "": refused("in degrees")},
     "09-gcp-text-forms": {
-        r"/(ordinary|bom|tabs|apostrophe|case|stem|geo-ordinary|geo-case)\.txt": WORKS,
+        r"/(ordinary|bom|tabs|apostrophe|case|stem|windows|geo-ordinary|geo-case)\.txt": WORKS,
         "utf16": refused("save it as UTF-8"),
-        r"/windows\.txt": refused("photographs that are not in the scene"),
         "": refused(r"expected|is not a photograph|name no photograph|photographs?"),
     },
     "10-masks": {
@@ -100,7 +99,7 @@ RIGHT: dict[str, dict[str, str | float]] = {
     "22-points-in-another-frame": {"(ordinary|cast)": WORKS, "": refused("are not in the frame of the cameras")},
     "23-pcd": {"==": MESHED},
     "26-exif-orientation": {
-        r"stored.*shown\.txt": refused("cannot be triangulated"),
+        r"stored.*shown\.txt": refused("(cannot be triangulated|pixels must be of photographs of that size)"),
         "capture": refused("cameras of only 0 of 10 photographs were found"),  # read, and too small for SfM
     },
     "31-georeferenced-colmap": {
