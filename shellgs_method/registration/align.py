@@ -26,7 +26,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
-from shellgs_method.registration.geotags import REACH, GeoTags, has_geo_tags
+from shellgs_method.registration.geotags import LEAST, REACH, GeoTags, count_geo_tags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
@@ -293,7 +293,11 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
             history.append(
                 "Most geo-tags repeat each other, as of a phone without a signal: check that this is the building."
             )
-    elif is_far and not unplaced.crs and has_geo_tags(views):
+    elif unplaced.crs and (count := count_geo_tags(views)):
+        history.append(
+            f"Geo-tags of {count} photographs were not used: the search needs three in the area of the shell's system."
+        )
+    elif is_far and not unplaced.crs and count_geo_tags(views) >= LEAST:
         history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
     imprecise, elsewhere = ([rival for rival in rivals if rival.is_imprecise == each] for each in (True, False))
     history += [

@@ -22,10 +22,11 @@ from shellgs_method.geometry.similarity import transformed
 REACH = 10.0
 """Median distance in metres of cameras from their geo-tags, beyond which an alignment is a wrong one; between
 buildings, signals are reflected."""
+LEAST = 3
+"""Geo-tags by which the search is kept to where they are."""
 _WALK = 50.0  # metres, within which photographs of a building were taken that have the same geo-tag
 _SPOT = 1.0  # metres, within which tags are on one spot
 _SHARED = 0.25  # of the cameras' spread, up to which those with the same tag may be apart
-_LEAST = 3
 _SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 
 
@@ -58,7 +59,7 @@ class GeoTags:
         degrees = np.array([place for _, place in tagged], dtype=np.float64)
         ground = conversion(CRS.from_epsg(4326), CRS.from_user_input(crs))(degrees)
         known = np.isfinite(ground).all(axis=1)
-        if known.sum() < _LEAST:
+        if known.sum() < LEAST:
             return None
         cameras = positions(view.camera for view, _ in tagged)[known]
         shell = np.pad(ground[known], ((0, 0), (0, 1)))
@@ -113,9 +114,9 @@ def _spread(places: Float64[np.ndarray, "N D"]) -> float:
     return float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))
 
 
-def has_geo_tags(views: Sequence[View]) -> bool:
-    """Whether enough photographs for :class:`GeoTags` have one."""
-    return len(_tagged(views)) >= _LEAST
+def count_geo_tags(views: Sequence[View]) -> int:
+    """Number of photographs that have one."""
+    return len(_tagged(views))
 
 
 def _tagged(views: Sequence[View]) -> list[tuple[View, tuple[float, float]]]:

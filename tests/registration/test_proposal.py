@@ -190,6 +190,9 @@ def test_geo_tags_of_a_phone_that_repeats_its_last_place_leave_the_scale_open(
     monkeypatch.setattr(align, "propose", lambda *_: [Candidate(survey_from_scene, score=0.9)])
     history = place_by_guess(mesh, shown, points, unplaced("s.ply", crs="EPSG:25832")).history
     assert any(sentence.startswith("Most geo-tags repeat each other") for sentence in history)
+    for count in (2, 0):
+        told = place_by_guess(mesh, shown[:count] + views, points, unplaced("s.ply", crs="EPSG:25832")).history[1:]
+        assert [sentence[:37] for sentence in told] == ["Geo-tags of 2 photographs were not us"] * (count > 0)
 
 
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.001])
