@@ -136,7 +136,7 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
         SceneError: the alignment is refused, doubtful, or a proposal, and not accepted.
     """
     from shellgs_method.registration.align import PROPOSAL, REPORT
-    from shellgs_method.registration.validation import LIKELIER
+    from shellgs_method.registration.validation import LIKELIER, LIMITS, OFF_PICKS
     from shellgs_method.shell import Alignment
 
     shell = recipe.sources[1:]
@@ -147,8 +147,6 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     proposed, named = not recipe.starts, shlex.quote(str(scene))
     accepted = done.has("accepted", key)
     written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
-    refined, picked, unit = bool(recipe.refine or proposed), bool(recipe.picks), recipe.metres_per_shell_unit
-    remedy = better_start(scene, shell, unit, recipe.crs, refined=refined, picked=picked)
     try:
         if not done.has("align", key) or not _is_there(written, scene):
             adjust = recipe.bundle_adjust and not proposed
@@ -171,6 +169,9 @@ def _align(recipe: Recipe, scene: Path, accept: bool, done: Record) -> None:
     aligned = Alignment.load(scene / (PROPOSAL if proposed else ALIGNMENT))
     if proposed or aligned.verdict != "good":
         open_page(report)
+        picked, unit = bool(recipe.picks), recipe.metres_per_shell_unit
+        refined = bool(recipe.refine or proposed or (aligned.metrics.get(OFF_PICKS) or 0.0) > LIMITS["picks"].good)
+        remedy = better_start(scene, shell, unit, recipe.crs, refined=refined, picked=picked)
         state, right = "a proposal" if proposed else "doubtful", f"the images in {report} agree"
         if likelier := aligned.metrics.get(LIKELIER):
             right, remedy = f"{right} and its unit is right", f"add --metres-per-shell-unit {likelier:g}, or {remedy}"

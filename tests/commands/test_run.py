@@ -12,7 +12,7 @@ import pytest
 from shellgs_method.commands import run as run_command
 from shellgs_method.commands.recipe import Recipe
 from shellgs_method.registration.align import PROPOSAL
-from shellgs_method.registration.validation import LIKELIER
+from shellgs_method.registration.validation import LIKELIER, OFF_PICKS
 from shellgs_method.shell import ALIGNMENT, Alignment
 
 
@@ -134,6 +134,16 @@ def test_a_doubted_unit_stops_the_run_with_the_option_that_gives_another(inputs,
     with Path("scene.run").open("a") as settings:
         settings.write("--metres-per-shell-unit 0.3048")
     assert shellgs("run") == "refused: cast"
+
+
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_a_shell_that_agreeing_picks_placed_is_not_to_be_refined(inputs, shellgs, monkeypatch):
+    photographs, shell, matrix = inputs
+    doubtful = replace(scene_alignment(inputs), verdict="doubtful", metrics={OFF_PICKS: 0.5})
+    monkeypatch.setattr(run_command, "align", lambda scene, _: doubtful.save(scene / ALIGNMENT))
+    assert "; else pick points" in shellgs("run", photographs, shell, "--matrix", matrix)
+    replace(doubtful, metrics={OFF_PICKS: 0.05}).save(Path("scene") / ALIGNMENT)
+    assert "; else add --refine 0.3, or pick points" in shellgs("run")
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
