@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from shellgs_method.registration.frames import ShellPlace, apart, heights_apart
 from shellgs_method.registration.geotags import LEAST, REACH, GeoTags, count_geo_tags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
-from shellgs_method.registration.proposal import AMBIGUOUS, propose
+from shellgs_method.registration.proposal import AMBIGUOUS, Candidate, propose
 from shellgs_method.registration.refinement import motion_in_words, refine
 from shellgs_method.registration.support import NEAR
 from shellgs_method.registration.validation import Check, check_of, rounding_of, steps_in_metres
@@ -284,21 +284,7 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     tags = GeoTags.of(views, unplaced.crs, surface.survey_from_shell) if unplaced.crs else None
     best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
-    is_far = np.abs(mesh.centre).max() * unplaced.metres_per_shell_unit > _LOCAL
-    if tags is not None:
-        off = tags.apart(best.survey_from_scene)
-        said = ": it agrees with none, so check that the building and --crs are the right ones" if off >= REACH else ""
-        history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}.")
-        if tags.repeated:
-            history.append(
-                "Most geo-tags repeat each other, as of a phone without a signal: check that this is the building."
-            )
-    elif unplaced.crs and (count := count_geo_tags(views)):
-        history.append(
-            f"Geo-tags of {count} photographs were not used: the search needs three in the area of the shell's system."
-        )
-    elif is_far and not unplaced.crs and count_geo_tags(views) >= LEAST:
-        history.append("The photographs have geo-tags: if --crs names the shell's system, the search is near them.")
+    history += _geo_tags_in_words(tags, best, mesh, views, unplaced)
     imprecise, elsewhere = ([rival for rival in rivals if rival.is_imprecise == each] for each in (True, False))
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
@@ -317,6 +303,23 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = replace(unplaced, shell_to_scene=matrix, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
+
+
+def _geo_tags_in_words(
+    tags: GeoTags | None, best: Candidate, mesh: ShellMesh, views: Sequence[View], unplaced: Alignment
+) -> Iterator[str]:
+    """How the geo-tags agree with a candidate, or why they were not used."""
+    is_far = np.abs(mesh.centre).max() * unplaced.metres_per_shell_unit > _LOCAL
+    if tags is not None:
+        off = tags.apart(best.survey_from_scene)
+        said = ": it agrees with none, so check that the building and --crs are the right ones" if off >= REACH else ""
+        yield f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m away from it{said}."
+        if tags.repeated:
+            yield "Most geo-tags repeat each other, as of a phone without a signal: check that this is the building."
+    elif unplaced.crs and (count := count_geo_tags(views)):
+        yield f"Geo-tags of {count} photographs were not used: it takes three in the area of the shell's system."
+    elif is_far and not unplaced.crs and count_geo_tags(views) >= LEAST:
+        yield "The photographs have geo-tags: if --crs names the shell's system, the search is near them."
 
 
 def up_in_words(alignment: Alignment) -> str:
