@@ -30,7 +30,7 @@ from shellgs_method.registration.geotags import LEAST, REACH, GeoTags, count_geo
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, Candidate, propose
-from shellgs_method.registration.refinement import motion_in_words, refine
+from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.support import NEAR
 from shellgs_method.registration.validation import Check, check_of, rounding_of, steps_in_metres
 from shellgs_method.shell.alignment import Alignment
@@ -285,21 +285,19 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     history += _geo_tags_in_words(tags, best, mesh, views, unplaced)
-    imprecise, elsewhere = ([rival for rival in rivals if rival.is_imprecise == each] for each in (True, False))
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
-        for rival in elsewhere
+        for rival in rivals
         if rival.score >= AMBIGUOUS * best.score
     ]
     checks = [check_of("agreement", best.score, "Agreement with the cameras' sightlines", "{:.0%}")]
-    for rival in elsewhere[:1]:
+    for rival in rivals[:1]:
         name = "Agreement elsewhere, relative to that in place"
         checks.append(check_of("elsewhere", rival.score / best.score, name, "{:.2f}"))
-    if imprecise:
-        farthest = max(imprecise, key=lambda rival: rival.displacement)
-        off, words = farthest.displacement, f"m or more {motion_in_words(farthest.shift)}"
-        history.append(f"Imprecise: by {off:.1f} {words}, along which the shell fits as well; picks of corners fix it.")
-        checks.append(check_of("imprecise", off, "Imprecision of the place", f"{{:.1f}} {words}"))
+    length, way = best.imprecision
+    if length:
+        history.append(f"Imprecise: it fits as well up to {length:.1f} m {way}; picks of corners fix it.")
+        checks.append(check_of("imprecise", length, "Imprecision of the place", f"{{:.1f}} m {way}"))
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = replace(unplaced, shell_to_scene=matrix, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)

@@ -10,7 +10,7 @@ proposal for the user to check.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -51,6 +51,7 @@ _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ
 _DIFFERENT_FROM_AFAR = 0.01
 _ONE_PLACE = 4.0  # metres of displacement, below which two candidates may be the same place
 _STEEP = 0.97  # share of a candidate's score, below which it is another place if the shell fits worse on the way to it
+_FLAT = 0.95  # share of the best score from which a shell fits as well; 10 to 20 cm beside its place, a scan has less
 _NEAR = 3 * REACH  # metres from geo-tags
 
 
@@ -62,16 +63,14 @@ class Candidate:
         survey_from_scene: similarity.
         score: agreement with the cameras' sightlines; between cells of grids at first.
         displacement: mean displacement of what is seen of the shell from the best candidate, in metres.
-        shift: mean vector of it in metres: right, up and out of the main wall.
-        is_imprecise: whether this is the place of the best candidate, which is imprecise along a plane wall: the shell
-            fits as well all the way.
+        imprecision: of the best candidate, how many metres and which way the shell may be moved along the main wall and
+            fits as well, as on bare walls.
     """
 
     survey_from_scene: Float64[np.ndarray, "4 4"]
     score: float
     displacement: float = 0.0
-    shift: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
-    is_imprecise: bool = False
+    imprecision: tuple[float, str] = (0.0, "")
 
 
 def propose(
@@ -312,9 +311,11 @@ class _Fit:
         return [candidate for candidate in polished if candidate.score > 0]
 
     def ranked(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Candidates that differ, the best first, and how far the others are from it."""
+        """Candidates of different places, the best first, how imprecise it is, and how far the others are from it."""
         kept = self.distinct(candidates, _POLISHED, self.different(candidates))
-        return [*kept[:1], *(self.compared(other, kept[0]) for other in kept[1:])]
+        best = [replace(each, imprecision=self.imprecision(each)) for each in kept[:1]]
+        others = (replace(other, displacement=self.apart(other, kept[0])) for other in kept[1:])
+        return [*best, *(other for other in others if not self.is_one_place(other, kept[0]))]
 
     def different(self, candidates: Sequence[Candidate]) -> float:
         """Metres from which candidates differ: the farther away the cameras are, the more."""
@@ -361,16 +362,34 @@ class _Fit:
                     break
         return [best[k] for k in kept]
 
-    def compared(self, other: Candidate, best: Candidate) -> Candidate:
-        """A candidate with how far it is from the best."""
-        points, to, end = self.points[:_MANY], best.survey_from_scene, other.survey_from_scene
-        moved = scale_of(to) * (transformed(points, np.linalg.inv(end) @ to) - points)
-        apart = float(np.linalg.norm(moved, axis=1).mean())
+    def apart(self, other: Candidate, best: Candidate) -> float:
+        """Mean displacement of the points between two candidates, in metres."""
+        points, to = self.points[:_MANY], best.survey_from_scene
+        moved = transformed(points, np.linalg.inv(other.survey_from_scene) @ to) - points
+        return scale_of(to) * float(np.linalg.norm(moved, axis=1).mean())
+
+    def is_one_place(self, other: Candidate, best: Candidate) -> bool:
+        """Whether a rival is where the best candidate is, imprecise as bare walls are: it fits as well all the way."""
+        if other.displacement >= _ONE_PLACE or other.score < AMBIGUOUS * best.score:
+            return False
         # In fifths, since halfway there may be the bay in between. So near, the mean of two similarities is one.
+        to, end = best.survey_from_scene, other.survey_from_scene
         way = (to + share * (end - to) for share in (0.2, 0.4, 0.6, 0.8))
-        is_close = apart < _ONE_PLACE and other.score >= AMBIGUOUS * best.score
-        flat = is_close and all(self.measured(each, _FIT).score >= _STEEP * other.score for each in way)
-        return replace(other, displacement=apart, shift=self.axes @ moved.mean(axis=0), is_imprecise=flat)
+        return all(self.measured(each, _FIT).score >= _STEEP * other.score for each in way)
+
+    def imprecision(self, best: Candidate) -> tuple[float, str]:
+        """How many metres, up to 4, and which way the shell may be moved and fits as well all the way there."""
+        turn = best.survey_from_scene[:3, :3] / scale_of(best.survey_from_scene)
+        right, up, _ = self.axes @ turn.T
+        step, farthest = self.different([best]), (0.0, "")
+        ways = {"upwards": up, "downwards": -up, "to the right": right, "to the left": -right}
+        for way, direction in ways.items():
+            for length in np.arange(step, _ONE_PLACE + 1e-9, step):
+                moved = affine(np.eye(3), -length * direction) @ best.survey_from_scene  # the scene, the other way
+                if self.measured(moved, _FIT).score < _FLAT * best.score:
+                    break
+                farthest = max(farthest, (float(length), way))
+        return farthest
 
 
 def _most(points: np.ndarray) -> np.ndarray:

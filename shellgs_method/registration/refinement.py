@@ -60,14 +60,10 @@ class Evidence:
         turn = np.kron(np.eye(2), axes)
         words = []
         for direction in self.directions[self.weak]:
-            words.append(motion_in_words(np.append(turn @ direction[:6], direction[6])))
+            share = np.append(turn @ direction[:6], direction[6]) ** 2
+            main = [k for k in np.argsort(-share) if share[k] > 0.15]
+            words.append(" with ".join(MOTIONS[k] for k in main))
         return words
-
-
-def motion_in_words(motion: Float64[np.ndarray, " M"]) -> str:
-    """The main ones of :data:`MOTIONS` in a motion, given by how far along each of them, or of the first ones."""
-    share = motion**2 / (motion @ motion)
-    return " with ".join(MOTIONS[k] for k in np.argsort(-share) if share[k] > 0.15)
 
 
 @dataclass(frozen=True)

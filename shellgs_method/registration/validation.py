@@ -81,7 +81,7 @@ LIMITS = {
         0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),
     "elsewhere": Limit(0.8, 0.93, "if the shell fits as well elsewhere, neither place is certain"),
-    "imprecise": Limit(0.15, 2.0, "a bare wall fits as well farther along itself: pick points at corners"),
+    "imprecise": Limit(0.15, 3.0, "a bare wall fits as well farther along itself: pick points at corners"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
     "bent_pixels": Limit(1.05, 1.2, "held-out points fit worse if the adjustment bends the cameras"),

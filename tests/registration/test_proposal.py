@@ -331,12 +331,9 @@ def test_a_candidate_stays_where_refining_it_makes_it_worse(surface, views, poin
     assert found.score > 0.8
 
 
-@pytest.mark.parametrize(
-    ("of_walls", "right", "up", "imprecise"),
-    [(True, 0.2, 0.8, True), (False, 0.0, 0.8, False), (False, 3.0, 0.0, False)],
-)
-def test_a_shift_along_a_bare_wall_is_imprecise_and_one_by_a_bay_is_another_place(
-    mesh, surface, views, points, survey_from_scene, of_walls, right, up, imprecise
+@pytest.mark.parametrize(("of_walls", "right", "up"), [(True, 0.2, 0.8), (False, 0.0, 0.8), (False, 3.0, 0.0)])
+def test_a_shift_along_a_bare_wall_is_one_place_and_one_by_a_bay_is_another(
+    mesh, surface, views, points, survey_from_scene, of_walls, right, up
 ):
     corners = np.array([[-30.0, 0, -20], [50, 0, -20], [50, 0, 30], [-30, 0, 30]])
     wall = ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]]))
@@ -348,21 +345,33 @@ def test_a_shift_along_a_bare_wall_is_imprecise_and_one_by_a_bay_is_another_plac
     seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
     fit = proposal._Fit.of(shell, shell.samples(500)[0], seen)
     best, other = (fit.measured(each, proposal._FIT) for each in (to, move @ to))
-    found = fit.compared(replace(other, score=best.score), best)
-    np.testing.assert_allclose(found.shift, [right, up, 0], atol=0.05)
-    assert found.displacement == pytest.approx(np.hypot(right, up), abs=0.05)
-    assert found.is_imprecise == imprecise
+    other = replace(other, score=best.score, displacement=fit.apart(other, best))
+    assert other.displacement == pytest.approx(np.hypot(right, up), abs=0.05)
+    assert fit.is_one_place(other, best) == of_walls
+    assert (fit.imprecision(best)[0] >= 0.5) == of_walls
 
 
-@pytest.mark.parametrize(("up", "verdict"), [(0.8, "doubtful"), (2.5, "refused")])
+@pytest.mark.parametrize(("low", "high", "way"), [(-20.0, 10.8, "upwards"), (0.0, 30.0, "downwards")])
+def test_imprecision_says_which_way_a_shell_may_be_moved(surface, views, points, survey_from_scene, low, high, way):
+    """A strip of a wall with an edge of what is seen at one end, and none at the other."""
+    corners = np.array([[5, 0, low], [10, 0, low], [10, 0, high], [5, 0, high]])
+    strip = ShellSurface(ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]])), 1.0)
+    x, y, _ = transformed(points.positions, np.linalg.inv(SCENE_FROM_BUILDING)).T
+    on = SparsePoints(points.positions[(x > 5) & (x < 10) & (np.abs(y) < 0.1)])
+    seen = proposal._Seen.of(views, on, SCENE_FROM_BUILDING[:3, 2])
+    fit = proposal._Fit.of(strip, strip.samples(500)[0], seen)
+    to = strip.survey_from_shell @ np.linalg.inv(surface.survey_from_shell) @ survey_from_scene
+    assert fit.imprecision(fit.measured(to, proposal._FIT)) == (4.0, way)
+
+
+@pytest.mark.parametrize(("up", "verdict"), [(0.8, "doubtful"), (3.5, "refused")])
 def test_an_imprecise_place_is_told_with_its_direction(
     mesh, views, points, survey_from_scene, monkeypatch, up, verdict
 ):
-    best = Candidate(survey_from_scene, 0.8)
-    rival = Candidate(survey_from_scene, 0.78, up, np.array([0.0, -up, 0.0]), is_imprecise=True)
-    monkeypatch.setattr(align, "propose", lambda *_: [best, rival])
+    best = Candidate(survey_from_scene, 0.8, imprecision=(up, "upwards"))
+    monkeypatch.setattr(align, "propose", lambda *_: [best])
     placement = place_by_guess(mesh, views, points, unplaced("shell/facade.ply"))
-    assert placement.history[-1].startswith(f"Imprecise: by {up} m or more upwards")
+    assert placement.history[-1].startswith(f"Imprecise: it fits as well up to {up} m upwards")
     assert [check.verdict for check in placement.checks] == ["good", verdict]
 
 
