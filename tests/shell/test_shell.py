@@ -354,6 +354,9 @@ def rows(matrix: np.ndarray, separator: str = " ") -> list[str]:
         lambda m: np.array2string(m, precision=17, separator=", "),
         lambda m: "[" + "; ".join(rows(m)) + "]",
         lambda m: " ".join(rows(m)),
+        lambda m: f"T = np.{np.array(m.tolist(), dtype=object)!r}",
+        lambda m: f"<Matrix 4x4 ({'), ('.join(rows(m, ', '))})>",  # Blender
+        lambda m: "scan_to_scene:\n" + "\n".join(f"  - [{row}]" for row in rows(m, ", ")),  # YAML
     ],
 )
 def test_a_matrix_is_read_as_programs_print_it(tmp_path: Path, printed: Callable[[np.ndarray], str]):
