@@ -206,7 +206,10 @@ class SceneLayout(ScenePaths):
         masks |= {frame.name: frame.mask for frame in frames if frame.mask}
         missing = [str(path) for path in masks.values() if path and not path.is_file()]
         if missing:
-            raise FileNotFoundError(f"{len(missing)} masks of {self.data} are not on disk ({missing[0]}, for example).")
+            raise FileNotFoundError(
+                f"{len(missing)} masks of {self.data} are not on disk ({missing[0]}, for example): put them back, or "
+                "remove their mask_path"
+            )
         return {name: path for name, path in masks.items() if path}
 
     def _candidates(self, folder: Path, name: str) -> Iterator[Path]:

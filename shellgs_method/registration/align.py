@@ -294,10 +294,11 @@ def place_by_guess(mesh: ShellMesh, views: Sequence[View], points: SparsePoints,
     for rival in rivals[:1]:
         name = "Agreement elsewhere, relative to that in place"
         checks.append(check_of("elsewhere", rival.score / best.score, name, "{:.2f}"))
-    length, way = best.imprecision
-    if length:
-        history.append(f"Imprecise: it fits as well up to {length:.1f} m {way}; picks of corners fix it.")
-        checks.append(check_of("imprecise", length, "Imprecision of the place", f"{{:.1f}} m {way}"))
+    if best.imprecision:
+        farthest = max(best.imprecision.values())
+        ways = ", ".join(f"up to {length:.1f} m {way}" for way, length in best.imprecision.items())
+        history.append(f"Imprecise: it fits nearly as well {ways}; picks of corners fix it.")
+        checks.append(check_of("imprecise", farthest, "Imprecision of the place", "{:.1f} m"))
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = replace(unplaced, shell_to_scene=matrix, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)

@@ -9,8 +9,8 @@ proposal for the user to check.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -63,14 +63,14 @@ class Candidate:
         survey_from_scene: similarity.
         score: agreement with the cameras' sightlines; between cells of grids at first.
         displacement: mean displacement of what is seen of the shell from the best candidate, in metres.
-        imprecision: of the best candidate, how many metres and which way the shell may be moved along the main wall and
-            fits as well, as on bare walls.
+        imprecision: of the best candidate, which ways and by less than how many metres the shell may be moved along the
+            main wall and fits nearly as well, as on bare walls.
     """
 
     survey_from_scene: Float64[np.ndarray, "4 4"]
     score: float
     displacement: float = 0.0
-    imprecision: tuple[float, str] = (0.0, "")
+    imprecision: Mapping[str, float] = field(default_factory=dict)
 
 
 def propose(
@@ -377,19 +377,21 @@ class _Fit:
         way = (to + share * (end - to) for share in (0.2, 0.4, 0.6, 0.8))
         return all(self.measured(each, _FIT).score >= _STEEP * other.score for each in way)
 
-    def imprecision(self, best: Candidate) -> tuple[float, str]:
-        """How many metres, up to 4, and which way the shell may be moved and fits as well all the way there."""
+    def imprecision(self, best: Candidate) -> dict[str, float]:
+        """Metres, at most 4, from which the shell fits worse if it is moved; without ways in which it does at once."""
         turn = best.survey_from_scene[:3, :3] / scale_of(best.survey_from_scene)
         right, up, _ = self.axes @ turn.T
-        step, farthest = self.different([best]), (0.0, "")
-        ways = {"upwards": up, "downwards": -up, "to the right": right, "to the left": -right}
-        for way, direction in ways.items():
-            for length in np.arange(step, _ONE_PLACE + 1e-9, step):
+        step, found = self.different([best]), {}
+        for way, direction in {"upwards": up, "downwards": -up, "to the right": right, "to the left": -right}.items():
+            length = step
+            while length < _ONE_PLACE:
                 moved = affine(np.eye(3), -length * direction) @ best.survey_from_scene  # the scene, the other way
                 if self.measured(moved, _FIT).score < _FLAT * best.score:
                     break
-                farthest = max(farthest, (float(length), way))
-        return farthest
+                length += step
+            if length > step:
+                found[way] = length
+        return found
 
 
 def _most(points: np.ndarray) -> np.ndarray:

@@ -260,7 +260,7 @@ class Alignment:
         metres_per_shell_unit: float = 1.0,
         global_shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Alignment:
-        """Read a row-major 4x4 matrix from a file: text as CloudCompare, NumPy, Blender and others print it, json or npy.
+        """Read a row-major 4x4 matrix from a file: text as CloudCompare, NumPy and Blender print it, json or npy.
 
         Args:
             path: the file.
@@ -330,7 +330,7 @@ _READ: dict[str, Callable[[Any], Any]] = {
 _AROUND_NUMBERS = re.compile(
     r"\[\d+:\d+:\d+\]|#.*|<Matrix 4x4|dtype=[\w.]+|[A-Za-z_][\w.]*(?= *[=:(\[])|^ *-(?= )|[\[\](),;:=>]", re.MULTILINE
 )
-"""What programs write beside the numbers of a matrix: the times of CloudCompare's console, comments, names, brackets."""
+"""What programs write beside the numbers of a matrix: times in CloudCompare's console, comments, names, brackets."""
 
 
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
