@@ -27,6 +27,7 @@ from shellgs_method.machine.progress import track
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.refinement import FINAL_GATE, refine
+from shellgs_method.registration.repetition import SHORTEST
 from shellgs_method.registration.sightlines import Sightlines
 from shellgs_method.registration.validation import LIMITS
 from shellgs_method.shell.surface import ShellSurface
@@ -198,9 +199,10 @@ class _Search:
             cell = float(np.clip(1.0, cell / 1.8, cell))
         rng = np.random.default_rng(0)
         sight, points = seen.sight, seen.points
-        share = rng.uniform(0.0, 0.95, (12, len(sight.points), 1))
-        empty = (sight.origins + share * (sight.points - sight.origins)).reshape(-1, 3)
         low, high = points.min(0), points.max(0)
+        back = sight.origins - sight.points
+        back *= np.minimum(1.0, np.linalg.norm(high - low) / np.linalg.norm(back, axis=1, keepdims=True))
+        empty = (sight.points + rng.uniform(0.05, 1.0, (12, len(back), 1)) * back).reshape(-1, 3)
         inside = ((empty > low) & (empty < high)).all(axis=1)
         return cls(samples, points, empty[inside], cell, scales, tags)
 
@@ -304,6 +306,7 @@ class _Fit:
             starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
             hopeful = track(starts, f"Refining candidates, round {number}", len(starts))
             starts = [found for s in hopeful for found in self.refined(s, few, reach * cell, _COARSE, steps)]
+        starts = [self.measured(start.survey_from_scene, _FIT) for start in starts]  # of far views, many fit coarsely
         starts, polished = self.distinct(starts, _POLISHED, self.different(starts)), []
         for start in track(starts, "Refining the best", len(starts)):
             reach = 2 * _COARSE * self.sight.distance(start.survey_from_scene)
@@ -311,8 +314,8 @@ class _Fit:
         return [candidate for candidate in polished if candidate.score > 0]
 
     def ranked(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Candidates of different places, the best first, how imprecise it is, and how far the others are from it."""
-        kept = self.distinct(candidates, _POLISHED, self.different(candidates))
+        """Candidates a bay or more apart, the best first, how imprecise it is, and how far the others are from it."""
+        kept = self.distinct(candidates, _POLISHED, max(SHORTEST, self.different(candidates)))
         best = [replace(each, imprecision=self.imprecision(each)) for each in kept[:1]]
         others = (replace(other, displacement=self.apart(other, kept[0])) for other in kept[1:])
         return [*best, *(other for other in others if not self.is_one_place(other, kept[0]))]

@@ -19,6 +19,8 @@ from shellgs_method.shell.surface import ShellSurface
 FIT = 0.10
 """Metres from the shell beyond which a point does not count as a fit: three to five times the scatter of SfM points,
 and less than the depth of a window's recess."""
+SHORTEST = 1.0
+"""Metres of the shortest bay."""
 RIVALRY = 0.90
 """Fit relative to that in place from which a shift is a rival: within 10 %."""
 BETTER = 1.02
@@ -27,7 +29,6 @@ _NEAR = 1.0  # metres: points farther away at every shift are not of the shell
 _STEP = 0.1
 _DEPTHS = np.arange(-0.8, 0.81, 0.02)  # metres: shifts along the normal, as the wall's plane is not known better
 _CLEAR = 0.3  # fit below which a shell is elsewhere, and its mirror image tells nothing
-_SHORTEST = 1.0  # metres: shortest bay
 _MAX_POINTS = 3000
 _MAX_STEPS = 250  # 25 m each way
 
@@ -51,12 +52,12 @@ class ShiftScan:
     @property
     def in_place(self) -> float:
         """Best fit at shifts of less than half the shortest bay."""
-        return float(self.fits[np.abs(self.shifts) < _SHORTEST / 2].max())
+        return float(self.fits[np.abs(self.shifts) < SHORTEST / 2].max())
 
     @property
     def elsewhere(self) -> tuple[float, float]:
         """Best shift of a metre or more, in metres, and its fit relative to the one in place."""
-        away = np.abs(self.shifts) >= _SHORTEST
+        away = np.abs(self.shifts) >= SHORTEST
         if not away.any():  # the shell is too small
             return 0.0, 0.0
         best = np.argmax(np.where(away, self.fits, -1.0))
@@ -147,7 +148,7 @@ def _period(edges: Float64[np.ndarray, "rows n"], cell: float) -> float | None:
     energy = np.cumsum((edges**2).sum(axis=0))
     overlap = np.sqrt(energy[::-1] * (energy[-1] - np.append(0.0, energy[:-1])))  # norms where both overlap
     correlation = product / np.maximum(overlap, 1e-9)
-    first, last = round(_SHORTEST / cell), int(0.75 * n)
+    first, last = round(SHORTEST / cell), int(0.75 * n)
     peaks = argrelmax(correlation[:last], order=max(1, round(0.2 / cell)))[0]
     peaks = peaks[peaks >= first]
     if len(peaks) == 0 or correlation[peaks].max() < 0.3:

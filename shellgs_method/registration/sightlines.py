@@ -35,6 +35,7 @@ class Sightlines:
         cells: the cell of its image, an index into ``rays``.
         centres: camera of each ray of the grid.
         rays: direction of that ray.
+        zoom: focal length of the cameras in longer sides of their images, at least 1.
     """
 
     origins: Float64[np.ndarray, "N 3"]
@@ -42,6 +43,7 @@ class Sightlines:
     cells: Int64[np.ndarray, " N"]
     centres: Float64[np.ndarray, "G 3"]
     rays: Float64[np.ndarray, "G 3"]
+    zoom: float
 
     @classmethod
     def of(cls, views: Sequence[View], points: SparsePoints) -> Sightlines:
@@ -68,11 +70,12 @@ class Sightlines:
                 )
             )
             first += len(rays)
-        return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        zooms = [float(view.camera.K[0, 0]) / max(view.camera.width, view.camera.height) for view in chosen]
+        return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)), max(1.0, float(np.median(zooms))))
 
     def distance(self, similarity: Float64[np.ndarray, "4 4"]) -> float:
-        """Median length of the sightlines in metres."""
-        return scale_of(similarity) * float(np.median(np.linalg.norm(self.points - self.origins, axis=1)))
+        """Median length of the sightlines in metres; with a long lens, from where a usual one would show the same."""
+        return scale_of(similarity) * float(np.median(np.linalg.norm(self.points - self.origins, axis=1))) / self.zoom
 
     def agreement(self, surface: Triangles, similarity: Float64[np.ndarray, "4 4"], tolerance: float) -> float:
         """Harmonic mean of the share of points on the visible shell, and of the visible shell that has such points.
@@ -80,15 +83,14 @@ class Sightlines:
         Args:
             surface: the shell.
             similarity: from the scene to the surface's frame.
-            tolerance: distance from the shell, relative to the median distance of the points from their cameras,
-                within which a point is on it.
+            tolerance: distance from the shell, relative to :meth:`distance`, within which a point is on it.
         """
         origins, points = transformed(self.origins, similarity), transformed(self.points, similarity)
         ahead = points - origins
         length = np.linalg.norm(ahead, axis=1)
         hits = surface.cast(origins, ahead)
         cosine = np.abs(np.einsum("nd,nd->n", ahead, hits.normal)) / np.maximum(length, 1e-12)
-        on = np.abs(hits.t - 1) * length * np.maximum(cosine, _LEAST_COSINE) < tolerance * np.median(length)
+        on = np.abs(hits.t - 1) * length * np.maximum(cosine, _LEAST_COSINE) < tolerance * self.distance(similarity)
         if not on.any():
             return 0.0
         seen = surface.blocked(transformed(self.centres, similarity), self.rays @ similarity[:3, :3].T)

@@ -28,6 +28,7 @@ from shellgs_method.registration.align import PROPOSAL, place_by_guess
 from shellgs_method.registration.geotags import GeoTags
 from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.proposal import Candidate
+from shellgs_method.registration.sightlines import Sightlines
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.synthetic.building import Layout, shell
@@ -59,6 +60,29 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
     found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene @ motion)
     assert placement.proposed
     assert error(surface, found, survey_from_scene) < 0.02
+
+
+def with_long_lens(view: View, times: float) -> View:
+    """The view from farther back with a longer lens, which shows about the same."""
+    camera = view.camera
+    viewmat, K = camera.viewmat.clone(), camera.K.clone()
+    viewmat[2, 3] += (times - 1) * 10.0 / scale_of(np.linalg.inv(SCENE_FROM_BUILDING))
+    K[:2, :2] *= times
+    return replace(view, camera=replace(camera, viewmat=viewmat, K=K))
+
+
+def test_with_a_long_lens_errors_are_as_from_where_a_usual_one_shows_the_same(views, points):
+    near, far = (Sightlines.of([with_long_lens(v, times) for v in views], points) for times in (4, 8))
+    assert near.distance(np.eye(4)) == pytest.approx(far.distance(np.eye(4)), rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_proposal_is_right_from_afar(mesh, surface, views, points, survey_from_scene):
+    far = [with_long_lens(view, 7) for view in views]
+    placement = place_by_guess(mesh, far, points, unplaced("shell/facade.ply"))
+    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
+    assert error(surface, found, survey_from_scene) < 0.02
+    assert all(check.verdict != "refused" for check in placement.checks)
 
 
 def tagged(folder: Path, views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[View]:
