@@ -71,7 +71,8 @@ class Sightlines:
             )
             first += len(rays)
         zooms = [float(view.camera.K[0, 0]) / max(view.camera.width, view.camera.height) for view in chosen]
-        return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)), max(1.0, float(np.median(zooms))))
+        zoom = max(1.0, float(np.median(zooms)))
+        return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)), zoom=zoom)
 
     def distance(self, similarity: Float64[np.ndarray, "4 4"]) -> float:
         """Median length of the sightlines in metres; with a long lens, from where a usual one would show the same."""
