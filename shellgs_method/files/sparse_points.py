@@ -17,11 +17,15 @@ from shellgs_method.files.scene import SceneLayout
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import Step, cloud_step, warn_of_coarse
+from shellgs_method.machine.open3d import import_open3d
 
 STACKED = 4
 """Points in one place whose Gaussians would begin without a width, as that is the distance of the three nearest; two,
 which COLMAP makes of a feature with two orientations, do no harm."""
 
+_BEHIND = 2.2  # spacings of points by which visible ones may be behind a plane through the others
+_LEAST_IN_VIEW, _MOST_IN_VIEW = 10, 20_000
+_FAR = 3.0  # times the median depth, beyond which points are left out: they would make the others' relief flat
 _ROUNDED = 2e-6  # of the extent of nine tenths of the points, by which places are the same
 
 
@@ -62,6 +66,29 @@ class SparsePoints:
     def of(self, view: View) -> Int[np.ndarray, " M"] | slice:
         """Indices of the points that a view observes; all where that is unknown."""
         return slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
+
+    def visible_in(self, view: View) -> Int[np.ndarray, " M"] | slice:
+        """Indices of the points that a view observes; where that is unknown, of some in it that others do not hide.
+
+        By hidden point removal (Katz et al., Direct Visibility of Point Sets, 2007), on at most 20 000 of them.
+        """
+        if self.observed is not None:
+            return self.of(view)
+        camera, open3d = view.camera, import_open3d()
+        inside, _, depth = in_view(camera, self.positions)
+        near = np.flatnonzero(inside)[depth < _FAR * np.median(depth)] if inside.any() else np.empty(0, int)
+        some = np.random.default_rng(0).permutation(near)[:_MOST_IN_VIEW]
+        if len(some) < _LEAST_IN_VIEW:
+            return some
+        spacing = np.sqrt(camera.width * camera.height / float(camera.K[0, 0] * camera.K[1, 1]) / len(some))
+        centre = camera.position.double().numpy()
+        farthest = np.linalg.norm(self.positions[some] - centre, axis=1).max()
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(self.positions[some]))
+        try:
+            _, visible = cloud.hidden_point_removal(centre, _BEHIND / spacing * farthest)
+        except RuntimeError:  # they are in a plane with the camera
+            return some
+        return some[np.asarray(visible)]
 
 
 def read_sparse_points(layout: SceneLayout) -> SparsePoints:

@@ -52,7 +52,7 @@ class Sightlines:
         chosen = [views[k] for k in spread(len(views), _VIEWS)]
         parts, first = [], 0
         for view in chosen:
-            seen = points.positions[points.of(view)]
+            seen = points.positions[points.visible_in(view)]
             inside, pixels, _ = in_view(view.camera, seen)
             some = rng.permutation(len(pixels))[:_PER_VIEW]
             grid = view.camera.shrunk(_COLUMNS)

@@ -106,6 +106,20 @@ def test_representative_views_are_spread_from_one_end_to_the_other(view):
     assert few == sorted(each.span(axis)[0] for each in some[:4])
 
 
+def test_without_tracks_points_that_others_hide_are_left_out_and_those_in_recesses_are_not(view):
+    random = np.random.default_rng(0)
+    front, behind = random.uniform(0, [WIDTH, HEIGHT], (2, 3000, 2))
+    recess = (np.abs(front - [320, 240]) < 60).all(axis=1)
+    depths = np.where(recess, DEPTH + 0.2, DEPTH), np.full(3000, DEPTH + 6)
+    sky = at(view, front[:20], np.full(20, 1e5))
+    points = SparsePoints(np.concatenate([at(view, front, depths[0]), at(view, behind, depths[1]), sky]))
+    found = np.asarray(points.visible_in(view))
+    assert (found < 3000).mean() > 0.9
+    assert np.isin(np.flatnonzero(recess), found).mean() > 0.5
+    in_line = SparsePoints(at(view, np.c_[np.arange(1.0, 21.0), np.full(20, 9)], np.full(20, DEPTH)))
+    assert len(np.asarray(in_line.visible_in(view))) == 20
+
+
 def sightlines(view: View, depth: float, columns: float) -> Sightlines:
     """Those to points all over the left columns of a view, a cell each, twice, and between them a view away from it."""
     u, v = (np.indices((14, 10)).reshape(2, -1).T + 0.5).T * [[WIDTH / 14], [HEIGHT / 10]]
