@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -74,9 +75,14 @@ class Sightlines:
         zoom = max(1.0, float(np.median(zooms)))
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)), zoom=zoom)
 
+    @cached_property
+    def _length(self) -> float:
+        """Median length of the sightlines, in the scene's units."""
+        return float(np.median(np.linalg.norm(self.points - self.origins, axis=1)))
+
     def distance(self, similarity: Float64[np.ndarray, "4 4"]) -> float:
         """Median length of the sightlines in metres; with a long lens, from where a usual one would show the same."""
-        return scale_of(similarity) * float(np.median(np.linalg.norm(self.points - self.origins, axis=1))) / self.zoom
+        return scale_of(similarity) * self._length / self.zoom
 
     def agreement(self, surface: Triangles, similarity: Float64[np.ndarray, "4 4"], tolerance: float) -> float:
         """Harmonic mean of the share of points on the visible shell, and of the visible shell that has such points.
