@@ -79,9 +79,9 @@ class FacadeDataParser(DataParser):
     georeferenced scene; here they are centred first, and ``dataparser_transform`` is in double precision.
 
     The outputs' cameras are pinhole cameras. Their metadata holds, in the order of the images, ``views`` (their
-    :class:`~shellgs_method.files.photographs.View`) and ``observed`` (indices of the SfM points that each observes, all
-    where that is unknown), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind), ``metres_per_unit``
-    (of nerfstudio's rescaled world) and ``shell_error`` (possible offset of the whole shell in metres), both None
+    :class:`~shellgs_method.files.photographs.View`), and for the whole scene ``points`` (its :class:`SparsePoints`),
+    ``cues`` (the :class:`CueMaps` found, by kind), ``metres_per_unit`` (of nerfstudio's rescaled world) and
+    ``shell_error`` (possible offset of the whole shell in metres), both None
     without a shell alignment. So that blocks know their scene: ``split``, the number of photographs of the whole scene
     in the split, and the indices among them of those used; ``cell``, the block's region in the rescaled world, None in
     a whole scene; and ``centre``, that of the whole scene's training cameras.
@@ -129,7 +129,7 @@ class FacadeDataParser(DataParser):
             dataparser_transform=torch.from_numpy(transform[:3]),
             metadata={
                 "points3D_xyz": torch.from_numpy(placed).float(),
-                "observed": [points.of(view) for view in views],
+                "points": points,
                 "points3D_rgb": torch.from_numpy(np.ascontiguousarray(points.colours)),
                 "views": views,
                 "cues": cues,

@@ -95,7 +95,7 @@ def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
         return None
     differences, images = ([], []), []
     for view in views[:: max(1, len(views) // _COMPARED)]:
-        of = points.of(view)
+        of = points.visible_in(view)
         camera = view.camera.shrunk(_SIZE)
         inside, pixels, _ = in_view(camera, points.positions[of])
         columns, rows = pixels.astype(int).T

@@ -10,12 +10,13 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers import full_images_datamanager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
+from scipy.interpolate import NearestNDInterpolator
 from torch import Tensor
 
 from dataparsers.cameras import scene_to_world
@@ -210,6 +211,13 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                 medians.append(float(grey[shown].median()))
         return max(1.0, DARK / float(np.median(medians))) if medians else 1.0
 
+    @cached_property
+    def _seen_points(self) -> list[Int[np.ndarray, " M"]]:
+        """Indices of the SfM points that are visible in each training photograph."""
+        metadata = self.train_dataparser_outputs.metadata
+        views, points = metadata["views"], metadata["points"]
+        return [points.visible_in(view) for view in views]
+
     def log_gains(self) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "N 3"]]:
         """Exposures of the training photographs, by their colours of the same points, or else by their EXIF data.
 
@@ -223,8 +231,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             seen = view_of_surface(camera, batch) if "shell_depth" in batch else None
             surface = None if seen is None else seen.shell.depth.where(seen.shell.mask, 0.0)[..., 0]
             exposures.append(Exposed.of(camera, photograph_of(batch), surface))
-        points, observed = self.sfm_points.float(), self.train_dataparser_outputs.metadata["observed"]
-        of_points = sightings_of_points(exposures, points, observed)
+        points = self.sfm_points.float()
+        of_points = sightings_of_points(exposures, points, self._seen_points)
         known = exif_log_gains([view.image for view in dataset.views])
         on_surface = sightings_on_surface(exposures, points_on_surface(exposures))
         gains = log_gains(of_points.with_others(on_surface), known)
@@ -245,7 +253,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
         def shown(views: range) -> Float64[np.ndarray, "N 3"]:
             exposures = [Exposed.of(dataset.camera(k), photograph_of(self.cached_train[k])) for k in views]
-            seen = sightings_of_points(exposures, points, [metadata["observed"][k] for k in views])
+            seen = sightings_of_points(exposures, points, [self._seen_points[k] for k in views])
             at_mean = exposed(torch.from_numpy(seen.colour), -torch.from_numpy(log_gains[views][seen.view]))
             return seen.means(at_mean.clamp(0, 1).numpy(), len(points))
 
@@ -262,7 +270,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                 f"{255 * apart:.0f} of 255 in the median: Gaussians start with the photographs' colours."
             )
         colours = shown(range(len(dataset)))
-        return torch.from_numpy(np.where(np.isfinite(colours), colours, np.nanmedian(colours, axis=0))).float()
+        found = np.isfinite(colours).all(axis=1)
+        return torch.from_numpy(NearestNDInterpolator(points[found], colours[found])(points)).float()
 
     def seed_views(
         self,

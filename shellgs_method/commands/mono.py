@@ -56,7 +56,7 @@ def mono(
     if predictor.non_commercial:
         warn("The licence of these weights forbids commercial use.")
     if points.observed is None:
-        console.print("The scene does not say which points a view observes: all points that project into it are used.")
+        console.print("The scene does not say which points a view observes: those that others do not hide are used.")
     size = f" --max-image-size {max_image_size}" if max_image_size else ""
     command = f"shellgs mono {{scene}}{size}{paths.flags} {source.command}"
     summary = make_maps(scene, views, points, predictor, command=command, max_image_size=max_image_size)

@@ -55,25 +55,21 @@ class SparsePoints:
         return cloud_step(self.positions)
 
     def seen_in(self, view: View) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]:
-        """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
+        """Pixels and z-depths of the points that are visible in a view (:meth:`visible_in`).
 
         The pixels are projections into the undistorted camera rather than the features that were matched in the
-        distorted photograph. Without observations, points hidden behind a surface are included.
+        distorted photograph.
         """
-        _, pixels, depth = in_view(view.camera, self.positions[self.of(view)])
+        _, pixels, depth = in_view(view.camera, self.positions[self.visible_in(view)])
         return pixels, depth
 
-    def of(self, view: View) -> Int[np.ndarray, " M"] | slice:
-        """Indices of the points that a view observes; all where that is unknown."""
-        return slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
-
-    def visible_in(self, view: View) -> Int[np.ndarray, " M"] | slice:
+    def visible_in(self, view: View) -> Int[np.ndarray, " M"]:
         """Indices of the points that a view observes; where that is unknown, of some in it that others do not hide.
 
         By hidden point removal (Katz et al., Direct Visibility of Point Sets, 2007), on at most 20 000 of them.
         """
         if self.observed is not None:
-            return self.of(view)
+            return self.observed.get(view.name, np.empty(0, int))
         camera, open3d = view.camera, import_open3d()
         inside, _, depth = in_view(camera, self.positions)
         near = np.flatnonzero(inside)[depth < _FAR * np.median(depth)] if inside.any() else np.empty(0, int)

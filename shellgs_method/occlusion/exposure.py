@@ -114,16 +114,16 @@ def sightings_on_surface(views: Sequence[Exposed], points: Float[Tensor, "N 3"])
 
 
 def sightings_of_points(
-    views: Sequence[Exposed], points: Float[Tensor, "N 3"], observed: Sequence[Int[ndarray, " M"] | slice]
+    views: Sequence[Exposed], points: Float[Tensor, "N 3"], visible: Sequence[Int[ndarray, " M"]]
 ) -> Sightings:
     """Sightings of SfM points.
 
     Args:
         views: the views.
         points: in the cameras' world.
-        observed: indices of the points that each view observes; all where that is unknown.
+        visible: indices of the points that are visible in each view.
     """
-    found = (_sightings(k, view, points, seen) for k, (view, seen) in enumerate(zip(views, observed, strict=True)))
+    found = (_sightings(k, view, points, seen) for k, (view, seen) in enumerate(zip(views, visible, strict=True)))
     return Sightings(*map(np.concatenate, zip(*found, strict=True)))
 
 
@@ -210,11 +210,11 @@ def _sightings(
     index: int,
     view: Exposed,
     points: Float[Tensor, "N 3"],
-    among: Int[ndarray, " M"] | slice = slice(None),
+    among: Int[ndarray, " M"] | None = None,
     hidden_by_surface: bool = False,
 ) -> Sightings:
     """Sightings of points in one view."""
-    chosen = np.arange(len(points))[among]
+    chosen = np.arange(len(points)) if among is None else among
     pixels, z = view.camera.project(points[torch.from_numpy(chosen)])
     inside = view.camera.contains(pixels, z)
     columns, rows = pixels.where(inside[..., None], 0.0).long().unbind(dim=-1)

@@ -137,7 +137,7 @@ class _Sight:
             return sight
         observed, features = [], []
         for view in views:
-            _, of_some, of_view = np.intersect1d(some, np.asarray(points.of(view)), return_indices=True)
+            _, of_some, of_view = np.intersect1d(some, points.visible_in(view), return_indices=True)
             observed.append(of_some)
             known = points.features.get(view.name)
             features.append(np.full((len(of_view), 2), np.nan) if known is None else known[of_view])
@@ -242,7 +242,7 @@ def _are_others(points: SparsePoints, photographs: Sequence[Shown]) -> bool:
     images = [shown.pixels for shown in photographs]
     own, others = [], []
     for shown in photographs:
-        image, of = shown.pixels, points.of(shown.view)
+        image, of = shown.pixels, points.visible_in(shown.view)
         pixels, colours = _kept(shown.view.camera, points.positions[of], points.colours[of], shown)
         if may_be_of(colours, [image]):
             own.append((colours, _at(pixels, image)))

@@ -176,6 +176,20 @@ def test_a_view_sees_the_points_that_the_scene_lists_for_it():
     assert len(SparsePoints(positions).seen_in(view_of())[1]) == 2
 
 
+def test_without_tracks_points_behind_the_wall_do_not_change_the_fit():
+    """In a walk around a building, most of the points in view are on its far sides."""
+    depth = plane_depth()
+    pixels, z = points_on(depth, 1500)
+    behind, _ = points_on(depth, 2500, seed=1)
+    depths = np.concatenate([z, np.random.default_rng(2).uniform(9, 12, 2500)])
+    homogeneous = np.concatenate([np.concatenate([pixels, behind]), np.ones((4000, 1))], axis=1)
+    points = SparsePoints(depths[:, None] * (homogeneous @ np.linalg.inv(K.numpy()).T))
+    fit = fit_disparity(disparity_of(depth), *points.seen_in(view_of()))
+    assert fit.points > 750
+    assert fit.inliers > 0.95
+    np.testing.assert_allclose([fit.scale, fit.shift], [A, B], rtol=1e-3, atol=1e-4)
+
+
 def test_points_of_a_cloud_are_read_in_the_scenes_frame(scene: Path):
     positions = exact_points(scene)
     write_cloud(scene, positions)

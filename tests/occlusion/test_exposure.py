@@ -121,7 +121,7 @@ def test_gains_are_found_on_a_surface_and_at_points_and_what_hides_it_does_not_c
     on_surface = sightings_on_surface(views, points_on_surface(views))
     np.testing.assert_allclose(log_gains(on_surface, UNKNOWN), GAINS, atol=0.02)
     points = torch.from_numpy(RNG.uniform([-1, -1, 4], [7, 1, 4], (2000, 3))).float()
-    everywhere = [slice(None)] * VIEWS
+    everywhere = [np.arange(len(points))] * VIEWS
     of_points = sightings_of_points(views, points, everywhere)
     others = np.arange(VIEWS) != 3  # half of what that one shows is not at the points, which do not know it
     np.testing.assert_allclose((log_gains(of_points, UNKNOWN) - GAINS)[others], 0, atol=0.04)

@@ -99,7 +99,7 @@ def test_points_have_tracks_of_the_views_that_show_them(scene: Path):
     assert points.observed is not None
     counts = np.zeros(len(points.positions))
     for view in views:
-        of = points.of(view)
+        of = points.visible_in(view)
         counts[of] += 1
         pixels, depth = project(view.camera, points.positions[of])
         assert (depth > 0).all()
