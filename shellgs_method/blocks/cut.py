@@ -18,7 +18,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.gaussians.skybox import skybox_radius
 from shellgs_method.gaussians.surroundings import FAR
-from shellgs_method.geometry.camera import world_rays
+from shellgs_method.geometry.camera import positions, world_rays
 from shellgs_method.geometry.planes import across
 from shellgs_method.geometry.similarity import affine, scale_of, transformed
 
@@ -91,10 +91,12 @@ def sights(views: Iterable[View], read: Callable[[View], CueMap | None]) -> Iter
         yield view.name, position + cue.depth[pixels][:, None] * rays[pixels]
 
 
-def tracked(points: SparsePoints, centre: Float64[np.ndarray, " 3"]) -> dict[str, Float64[np.ndarray, "K 3"]]:
-    """SfM points that each photograph observes, without those too far from the cameras' centre to be of any block."""
+def visible_points(points: SparsePoints, views: Sequence[View]) -> dict[str, Float64[np.ndarray, "K 3"]]:
+    """SfM points that are visible in each photograph, without those too far from the cameras to be of any block."""
+    centre = positions(view.camera for view in views).mean(axis=0)
     near = np.linalg.norm(points.positions - centre, axis=1) < FAR * skybox_radius(centre, points.positions)
-    found = {name: points.positions[of[near[of]]].astype(np.float64) for name, of in (points.observed or {}).items()}
+    visible = ((view.name, points.visible_in(view)) for view in views)
+    found = {name: points.positions[of[near[of]]].astype(np.float64) for name, of in visible}
     return {name: each for name, each in found.items() if len(each)}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -90,11 +89,10 @@ def blocks(
 
 def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     """What the photographs of a scene show of the shell, by its maps, or else of the SfM points."""
-    from shellgs_method.blocks.cut import Sights, assumed_metres, sights, tracked
+    from shellgs_method.blocks.cut import Sights, assumed_metres, sights, visible_points
     from shellgs_method.files.cue_maps import CueMaps, find_cues
-    from shellgs_method.files.sparse_points import find_sparse_points
+    from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.geometry.axes import likely_up
-    from shellgs_method.geometry.camera import positions
     from shellgs_method.machine.progress import track
     from shellgs_method.shell import ALIGNMENT, Alignment
 
@@ -106,13 +104,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
         reading = track(shrunk, "Reading the shell's maps", len(views))
         shown = dict(sights(reading, lambda view: maps.read(view.name, view.camera)))
     else:
-        points = find_sparse_points(layout)
-        if points.observed is None:
-            raise SceneError(
-                f"{scene} has neither maps of a shell nor tracks of its SfM points, which say what each photograph "
-                f"shows: align a shell, and run `shellgs cast {shlex.quote(str(scene))}` first"
-            )
-        shown = tracked(points, positions(view.camera for view in views).mean(axis=0))
+        shown = visible_points(read_sparse_points(layout), views)
     if not shown:
         raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
     if metres is None:

@@ -11,17 +11,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scenes import parse, views_of
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, trainable_cells
-from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, assumed_metres, cut, tracked
+from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, assumed_metres, cut, visible_points
 from shellgs_method.blocks.walls import Walls
 from shellgs_method.commands.blocks import blocks as command
 from shellgs_method.errors import SceneError
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
+from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import affine, transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.occlusion import DISPLACED, Displaced
 from shellgs_method.synthetic import StreetConfig
@@ -247,7 +250,8 @@ def test_sfm_points_that_no_block_has_do_not_count(street: np.ndarray):
     far = np.array([[1e6, 1e6, 0.0]])
     indices = np.arange(len(street))
     points = SparsePoints(np.concatenate([street, far]), {"a": indices, "b": np.append(indices[:5], len(street))})
-    shown = tracked(points, street.mean(axis=0))
+    camera = Camera(torch.from_numpy(affine(np.eye(3), -street.mean(axis=0))), torch.eye(3), 4, 3)
+    shown = visible_points(points, [View(name, Path(name), camera) for name in "ab"])
     np.testing.assert_array_equal(shown["a"], street)
     np.testing.assert_array_equal(shown["b"], street[:5])
 
@@ -333,10 +337,10 @@ def test_the_command_cuts_a_scene_anew_that_was_one_block(scene: Path):
     assert len(Blocks.read(scene / BLOCKS).cells) > 1
 
 
-def test_without_maps_and_tracks_nothing_tells_what_photographs_show(scene: Path):
+def test_without_maps_and_tracks_the_command_cuts_by_the_points_in_view(scene: Path):
     shutil.rmtree(scene / "cues")
-    with pytest.raises(SceneError, match="run `shellgs cast"):
-        command(scene)
+    command(scene, length=1.5, overlap=0.2)
+    assert len(Blocks.read(scene / BLOCKS).cells) > 1
 
 
 @pytest.mark.parametrize("flags", [{"length": 0.0}, {"overlap": -1.0}, {"photographs": 3}])
