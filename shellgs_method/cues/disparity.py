@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -36,7 +37,7 @@ class DisparityFit:
         residual: median depth error |Δz| / z over the points.
         spread: range of the points' disparities (5th to 95th percentile), relative to their median.
         farthest: depth within which 99 % of the inliers lie, in scene units.
-        otherwise: the residual if depths were distances or distances depths; None where they are known.
+        otherwise: the residual if the map's values meant something else, by what they meant; empty where it is known.
     """
 
     points: int
@@ -46,7 +47,7 @@ class DisparityFit:
     residual: float = 1.0
     spread: float = 0.0
     farthest: float = 0.0
-    otherwise: float | None = None
+    otherwise: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def problem(self) -> str | None:
@@ -97,6 +98,8 @@ def fit_disparity(
     if spread < MIN_SPREAD or np.ptp(x) < 1e-6 * np.abs(x).max():  # below float32's precision
         return DisparityFit(len(x), spread=spread)
     scale, shift = _robust_line(x, y)
+    if not scale > 0:
+        return DisparityFit(len(x), scale, shift, spread=spread)
     error = np.abs(1 / np.maximum(scale * x + shift, 1e-12) - 1 / y) * y
     inlier = error < INLIER
     farthest = float(1 / np.percentile(y[inlier], 1)) if inlier.any() else 0.0

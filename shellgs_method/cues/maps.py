@@ -114,8 +114,8 @@ def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[
         return None, None
     pixels, z = points.seen_in(view)
     fit = fit_disparity(prediction.disparity, pixels, z)
-    if prediction.otherwise is not None:
-        fit = replace(fit, otherwise=fit_disparity(prediction.otherwise, pixels, z).residual)
+    others = {values: fit_disparity(other, pixels, z) for values, other in prediction.otherwise.items()}
+    fit = replace(fit, otherwise={values: other.residual for values, other in others.items()})
     if fit.problem:
         return fit, None
     depth = aligned_depth(prediction.disparity, fit)
@@ -143,14 +143,15 @@ def _check_one_view(views: Sequence[View], points: SparsePoints, predictor: Pred
 
 def _misread(predictor: Predictor, fits: Sequence[dict]) -> str | None:
     """As what the values of maps fit the SfM points better than as what they are said to be, in words."""
-    both = [(fit["residual"], fit["otherwise"]) for fit in fits if fit.get("otherwise") is not None]
-    if predictor.values is None or not both:
+    said, fits = predictor.values, [fit for fit in fits if fit.get("otherwise")]
+    if not fits:
         return None
-    residual, otherwise = np.median(both, axis=0)
-    if np.median([other / max(own, 1e-9) for own, other in both]) > _BETTER:
+    off = {values: float(np.median([fit["otherwise"][values] for fit in fits])) for values in fits[0]["otherwise"]}
+    other = min(off, key=lambda values: off[values])
+    if np.median([fit["otherwise"][other] / max(fit["residual"], 1e-9) for fit in fits]) > _BETTER:
         return None
-    said, other = predictor.values
-    return f"as {other} than as {said} ({otherwise:.1%} off in the median, not {residual:.1%}): give --values {other}"
+    residual = np.median([fit["residual"] for fit in fits])
+    return f"as {other} than as {said} ({off[other]:.1%} off in the median, not {residual:.1%}): give --values {other}"
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".npy", ".npz", ".png")
 ASPECT_TOLERANCE = 0.02  # networks round sizes to multiples of 14 or 32
-_OTHERWISE = {"depth": "distance", "distance": "depth"}
-"""What values may be that are said to be something else."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,6 @@ class Precomputed:
         from shellgs_method.cues.normals import decoded, to_opencv
         from shellgs_method.cues.source import Prediction, Predictor, hash_of
 
-        other = _OTHERWISE.get(self.values)
         maps = MapFolder(self.folder, (self.values.replace("-", "_"), "disparity", "inverse_depth", "depth", "arr_0"))
         normals = None if self.normals is None else MapFolder(self.normals, ("normal", "normals", "arr_0"))
 
@@ -73,12 +70,13 @@ class Precomputed:
                 normal = to_opencv(decoded(normal), self.convention)
                 normal = _in_view(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
             disparity = _in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0]
-            if not other:
-                return Prediction(disparity, normal)
-            oblique = disparity * view.camera.rays().norm(dim=-1).numpy().astype(np.float32)
-            if self.values == "distance":
-                return Prediction(oblique, normal, disparity)
-            return Prediction(disparity, normal, oblique)
+            inverse = as_disparity(disparity, "depth")
+            if self.values in ("depth", "distance"):
+                disparity, inverse = inverse, disparity
+            oblique = inverse * view.camera.rays().norm(dim=-1).numpy().astype(np.float32)
+            meanings = {"disparity": disparity, "depth": inverse, "distance": oblique}
+            said = meanings.pop("disparity" if self.values == "inverse-depth" else self.values)
+            return Prediction(said, normal, meanings)
 
         files = [*maps.named, *(normals.named if normals else ())]
         revision = hash_of(files, self.values, self.convention)
@@ -87,7 +85,7 @@ class Precomputed:
             revision,
             predict,
             convention=self.convention if normals else None,
-            values=(self.values, other) if other else None,
+            values=self.values,
         )
 
 

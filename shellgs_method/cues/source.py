@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,12 @@ class Prediction:
         disparity: disparity, larger where nearer, affine in the inverse depth; NaN where unknown.
         normal: normals in the OpenCV camera frame, of either sign and any length, zero where unknown; None to use
             those of the depth's gradient.
-        otherwise: disparity if depths were distances along the pixels' rays, or the other way round; None if that is
-            known.
+        otherwise: disparity if the values meant something else, by what they meant; empty where it is known.
     """
 
     disparity: Float32[np.ndarray, "H W"]
     normal: Float[np.ndarray, "H W 3"] | None = None
-    otherwise: Float32[np.ndarray, "H W"] | None = None
+    otherwise: Mapping[str, Float32[np.ndarray, "H W"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Predictor:
         predict: function from a view to its prediction; None if there is none.
         licence: licence of the weights, as stated in their model card; None for existing maps.
         convention: declared axes of the normals, to be checked; None if they are known.
-        values: declared meaning of the values and the one that they may have instead; None if it is known.
+        values: declared meaning of the values, to be checked; None if it is known.
     """
 
     name: str
@@ -51,7 +50,7 @@ class Predictor:
     predict: Callable[[View], Prediction | None]
     licence: str | None = None
     convention: Convention | None = None
-    values: tuple[str, str] | None = None
+    values: str | None = None
 
     @property
     def non_commercial(self) -> bool:

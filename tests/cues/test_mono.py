@@ -638,6 +638,19 @@ def test_wrong_axes_are_refused_with_the_view_and_the_right_ones(scene: Path, tm
     assert "as opengl" in sentence
 
 
+@pytest.mark.parametrize(("said", "right"), [("disparity", "depth"), ("depth", "disparity")])
+def test_depth_and_disparity_are_told_apart(said: str, right: str, scene: Path, tmp_path: Path, monkeypatch, capsys):
+    write_cloud(scene, exact_points(scene))
+    write_maps(scene, tmp_path / "maps")
+    if right == "disparity":
+        for view, cue in truths(scene):
+            np.save(tmp_path / "maps" / f"{Path(view.name).stem}.npy", disparity_of(cue.depth.clip(1.0)))
+            (tmp_path / "maps" / f"{Path(view.name).stem}.npz").unlink()
+    sentence = run(monkeypatch, capsys, scene, "from", tmp_path / "maps", "--values", said, status=False)
+    assert "its disparity does not increase towards the camera" in sentence
+    assert re.search(rf"they fit better as {right} than as {said} .*: give --values {right}", sentence)
+
+
 @pytest.mark.parametrize(("said", "right"), [("depth", "distance"), ("distance", "depth")])
 def test_distances_and_depths_are_told_apart(
     said: str, right: str, scene: Path, tmp_path: Path, monkeypatch, capsys, caplog
