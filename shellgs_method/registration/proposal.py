@@ -53,6 +53,7 @@ _DIFFERENT_FROM_AFAR = 0.01
 _ONE_PLACE = 4.0  # metres of displacement, below which two candidates may be the same place
 _STEEP = 0.97  # share of a candidate's score, below which it is another place if the shell fits worse on the way to it
 _FLAT = 0.95  # share of the best score from which a shell fits as well; 10 to 20 cm beside its place, a scan has less
+_UPRIGHT = 0.9  # cosine of the building's up direction and an axis of the shell's file
 _NEAR = 3 * REACH  # metres from geo-tags
 
 
@@ -318,7 +319,8 @@ class _Fit:
         kept = self.distinct(candidates, _POLISHED, max(SHORTEST, self.different(candidates)))
         best = [replace(each, imprecision=self.imprecision(each)) for each in kept[:1]]
         others = (replace(other, displacement=self.apart(other, kept[0])) for other in kept[1:])
-        return [*best, *(other for other in others if not self.is_one_place(other, kept[0]))]
+        rivals = (other for other in others if not self.is_upside_down(other, kept[0]))
+        return [*best, *(rival for rival in rivals if not self.is_one_place(rival, kept[0]))]
 
     def different(self, candidates: Sequence[Candidate]) -> float:
         """Metres from which candidates differ: the farther away the cameras are, the more."""
@@ -370,6 +372,12 @@ class _Fit:
         points, to = self.points[:_MANY], best.survey_from_scene
         moved = transformed(points, np.linalg.inv(other.survey_from_scene) @ to) - points
         return scale_of(to) * float(np.linalg.norm(moved, axis=1).mean())
+
+    def is_upside_down(self, other: Candidate, best: Candidate) -> bool:
+        """Whether another candidate turns the building over, where the best has z or y of the shell's file up."""
+        placed = (each.survey_from_scene for each in (best, other))
+        up, down = (to[:3, :3] @ self.axes[1] / scale_of(to) for to in placed)
+        return max(up[1:]) > _UPRIGHT and up @ down < -_UPRIGHT
 
     def is_one_place(self, other: Candidate, best: Candidate) -> bool:
         """Whether a rival is where the best candidate is, imprecise as bare walls are: it fits as well all the way."""

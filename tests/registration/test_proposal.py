@@ -21,7 +21,7 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.axes import turn
-from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.geometry.similarity import affine, scale_of, transformed
 from shellgs_method.geometry.triangles import stacked
 from shellgs_method.registration import align, proposal
 from shellgs_method.registration.align import PROPOSAL, place_by_guess
@@ -373,6 +373,19 @@ def test_a_shift_along_a_bare_wall_is_one_place_and_one_by_a_bay_is_another(
     assert other.displacement == pytest.approx(np.hypot(right, up), abs=0.05)
     assert fit.is_one_place(other, best) == of_walls
     assert bool(fit.imprecision(best)) == of_walls
+
+
+@pytest.mark.parametrize("up_in_file", [True, False])
+def test_a_candidate_that_turns_a_building_over_is_no_rival_where_the_file_is_upright(
+    surface, views, points, survey_from_scene, up_in_file
+):
+    seen = proposal._Seen.of(views, points, SCENE_FROM_BUILDING[:3, 2])
+    over = affine(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix(), np.zeros(3))
+    best, other = Candidate(survey_from_scene, 0.8), Candidate(over @ survey_from_scene, 0.79)
+    if not up_in_file:
+        best, other = replace(other, score=0.8), replace(best, score=0.79)
+    fit = proposal._Fit.of(surface, surface.samples(500)[0], seen)
+    assert len(fit.ranked([best, other])) == (1 if up_in_file else 2)
 
 
 @pytest.mark.parametrize(("low", "high", "way"), [(-20.0, 10.8, "upwards"), (0.0, 30.0, "downwards")])
