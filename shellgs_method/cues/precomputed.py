@@ -30,7 +30,7 @@ class Precomputed:
 
     # tyro reads these types: they are written out, with Optional for Python 3.10.
     folder: Path
-    """Folder of the maps; zero and NaN stand for no value."""
+    """Folder of the maps; zero and NaN stand for no value, and so does the largest integer for no depth or distance."""
     values: Literal["disparity", "inverse-depth", "depth", "distance"] = "disparity"
     """Meaning of the maps' values, in any unit: disparity (up to a shift), inverse depth, z-depth, or distance from the
     camera along the pixel's ray, as of lidars and some renderers."""
@@ -64,7 +64,10 @@ class Precomputed:
             values = maps.read(view, channels=1)
             if values is None:
                 return None
-            disparity = as_disparity(values[..., 0].astype(np.float32), self.values)
+            numbers = values[..., 0]
+            if self.values in ("depth", "distance") and numbers.dtype.kind in "iu":
+                numbers = np.where(numbers == np.iinfo(numbers.dtype).max, 0, numbers)  # the sky, or unknown
+            disparity = as_disparity(numbers.astype(np.float32), self.values)
             normal = normals.read(view, channels=3) if normals else None
             if normal is not None:
                 normal = to_opencv(decoded(normal), self.convention)

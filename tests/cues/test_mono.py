@@ -233,6 +233,16 @@ def test_every_format_gives_the_same_map(tmp_path: Path, suffix: str, save: Call
     np.testing.assert_allclose(found / found[0, 0], depth[0, 0] / depth, rtol=rtol)
 
 
+@pytest.mark.parametrize(("values", "known"), [("depth", 6), ("distance", 6), ("disparity", 8)])
+def test_depth_at_the_end_of_its_integers_is_none(tmp_path: Path, values: str, known: int):
+    """Of the sky, or where a sensor failed; the nearest of a disparity that fills the integers is one."""
+    stored = np.linspace(40_000, 65_000, CAMERA.width * CAMERA.height).reshape(CAMERA.height, CAMERA.width)
+    stored[: CAMERA.height // 4] = 65_535
+    Image.fromarray(stored.astype(np.uint16)).save(tmp_path / "a.png")
+    found = np.isfinite(predicted(tmp_path, view_of(), values=values).disparity)
+    assert found.sum() * 8 == known * found.size
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_map_of_another_size_is_resized_in_disparity(tmp_path: Path, factor: float):
     stretch = torch.tensor([factor, factor, 1.0], dtype=torch.float64)[:, None]
