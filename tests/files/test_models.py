@@ -776,6 +776,15 @@ def test_parts_of_an_ifc_without_a_placement_are_told(tmp_path: Path, caplog):
     assert f"parts have a shape but no placement, which IFC requires, such as IfcWall {wall.GlobalId}" in caplog.text
 
 
+def test_parts_of_an_ifc_that_are_placed_relative_to_each_other_are_refused(tmp_path: Path):
+    """As Bonsai has written them; ifcopenshell would end the process."""
+    file = made.ifc_house()
+    wall, site = file.model.by_type("IfcWall")[0].ObjectPlacement, file.site.ObjectPlacement
+    site.PlacementRelTo = wall
+    with pytest.raises(SceneError, match=f"relative to each other in a circle, (#{wall.id()}|#{site.id()}|, ){{3}}:"):
+        read_geometry(file.save(tmp_path / "a.ifc"))
+
+
 def test_a_shape_of_an_ifc_without_items_is_said(tmp_path: Path, caplog):
     file = made.Ifc()
     file.block("IfcWall", (0, 0, 0), (6, 0.3, 3))

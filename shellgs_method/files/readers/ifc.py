@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
@@ -104,6 +105,7 @@ def read_ifc(path: Path) -> Geometry:
     ifcopenshell.get_log()  # which empties it
     model: Any = _opened(path, ifcopenshell)
     _one_project(path, model)
+    _placed_in_a_tree(path, model)
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     _complete(path, model, products)
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
@@ -228,6 +230,24 @@ def _one_project(path: Path, model: Any) -> None:
     for each in model.by_type("IfcProject" if model.schema == "IFC2X3" else "IfcContext"):
         if each != projects[0]:
             model.remove(each)
+
+
+def _placed_in_a_tree(path: Path, model: Any) -> None:
+    """Check that no placement is relative to itself, which ends ifcopenshell, and this process with it.
+
+    Raises:
+        SceneError: one is, perhaps by way of others.
+    """
+    placements = model.by_type("IfcObjectPlacement")
+    above = {each.id(): getattr(each, "PlacementRelTo", None) for each in placements}
+    try:
+        TopologicalSorter({name: [each.id()] for name, each in above.items() if each}).prepare()
+    except CycleError as error:
+        circle = ", ".join(f"#{name}" for name in error.args[1][1:])
+        raise SceneError(
+            f"the shell {path} has placements that are relative to each other in a circle, {circle}: export it again, "
+            "or correct one of these lines"
+        ) from error
 
 
 def _complete(path: Path, model: Any, products: list) -> None:
