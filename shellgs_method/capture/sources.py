@@ -36,6 +36,8 @@ _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neig
 _SMALL, _ALIKE = 32, 0.15
 _BLOCK = 4  # pixels of a side, whose means are compared first
 _IN_COLOUR, _FEW_VALUES = {"RGB", "RGBA", "YCbCr", "CMYK"}, 8  # modes of Pillow; values of a map that is no photograph
+_PLAIN, _MOST_LABELS = 0.1, 64  # bytes of a pixel that photographs exceed; colours of a map of labels at most
+_NOISE, _BORDERS = 16, 0.05  # of masks: of compression, in black and white; share of soft borders between them
 _SAME = 0.3  # pixels by which pictures may seem moved that show the same: those encoded again by 0.04, others by 0.9
 
 
@@ -90,18 +92,20 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
 
 
 def _without_maps(folder: Path, photographs: Sequence[Path]) -> list[Path]:
-    """Photographs without maps of depth, confidence or labels beside those in colour, which are reported.
+    """Photographs without maps of depth, confidence or labels, and masks, beside those in colour, which are reported.
 
     Apps that scan (Polycam, 3D Scanner App, RTAB-Map) export these with the photographs, in grey: depth with 16 bits,
-    the others with few values. Cameras that take such photographs name themselves in EXIF.
+    the others with few values. Masks may have three channels, and noise as JPEG. Cameras that take such photographs
+    name themselves in EXIF.
     """
-    if not any(_is_in_colour(path) for path in photographs):
-        return [*photographs]
     maps = dict.fromkeys(path for path in photographs if _is_map(path))
+    if not any(_is_in_colour(path) for path in photographs if path not in maps):
+        return [*photographs]
     if maps:
         notice(
-            f"{len(maps)} files of {folder} are maps of depth, confidence or labels, by their values, and are left "
-            f"out: {next(iter(maps)).relative_to(folder)}, for example. If they are photographs, save them with 8 bits."
+            f"{len(maps)} files of {folder} are masks or maps of depth, confidence or labels, by their values, and are "
+            f"left out: {next(iter(maps)).relative_to(folder)}, for example. Masks must be in a folder of their own, "
+            "given with --masks; photographs must have 8 bits."
         )
     return [path for path in photographs if path not in maps]
 
@@ -114,10 +118,19 @@ def _is_in_colour(photograph: Path) -> bool:
 
 def _is_map(photograph: Path) -> bool:
     with suppress(Exception), Image.open(photograph) as image:
-        if image.mode in _IN_COLOUR or ExifTags.Base.Make in image.getexif():
+        if ExifTags.Base.Make in image.getexif():
             return False
+        if image.mode in _IN_COLOUR:
+            is_small = photograph.stat().st_size < _PLAIN * image.width * image.height  # others are not decoded
+            return is_small and (len(image.getcolors(_MOST_LABELS) or ()) > 1 or _is_black_and_white(image))
         return image.mode[:1] in ("I", "F") or image.getcolors(_FEW_VALUES) is not None
     return False
+
+
+def _is_black_and_white(image: Image.Image) -> bool:
+    pixels = np.asarray(image.convert("RGB"))
+    extreme = ((pixels <= _NOISE).all(axis=2) | (pixels >= 255 - _NOISE).all(axis=2)).mean()
+    return bool(extreme > 1 - _BORDERS)
 
 
 def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:

@@ -114,7 +114,20 @@ def test_maps_of_depth_and_confidence_beside_photographs_in_colour_are_left_out_
     Image.fromarray((grey % 3).astype(np.uint8)).save(tmp_path / "conf_1.png")
     found = list(find_photographs(tmp_path))
     assert found == ["frame_1.jpg", "grey_1.png"] if in_colour else len(found) == 4
-    assert ("2 files of" in caplog.text and "are maps of depth, confidence or labels" in caplog.text) == in_colour
+    assert (
+        "2 files of" in caplog.text and "are masks or maps of depth, confidence or labels" in caplog.text
+    ) == in_colour
+
+
+@pytest.mark.parametrize(("name", "colour"), [("a_mask.png", 0), ("a_mask.JPG", 0), ("a.png", (128, 64, 128))])
+def test_masks_and_labels_of_three_channels_beside_photographs_are_left_out_and_told(tmp_path, caplog, name, colour):
+    """As for OpenDroneMap; masks as JPEG have noise."""
+    photograph(640, 480).convert("RGB").save(tmp_path / "a.jpg")
+    drawn = np.full((480, 640, 3), 255, np.uint8)
+    drawn[100:300, 150:400] = colour
+    Image.fromarray(drawn).save(tmp_path / name)
+    assert list(find_photographs(tmp_path)) == ["a.jpg"]
+    assert "1 files of" in caplog.text
 
 
 def test_photographs_of_a_camera_in_grey_of_16_bits_are_kept_beside_those_in_colour(tmp_path, caplog):
