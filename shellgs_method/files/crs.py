@@ -194,17 +194,32 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
                 f"{where}: {_words(points[0])} is outside the area of {wanted.name}, and inside it with the latitude "
                 "as longitude: write the longitude first, or name the columns in a header"
             )
+        small = len(points) and np.abs(points[:, :2]).max() <= 180
+        if not source.is_geographic and small and (inside.all() or turned.all()):
+            raise SceneError(
+                f"{where}: {_words(points[0])} is said to be in {source.name}, but is longitude and latitude in the "
+                f"area of {wanted.name}: name EPSG:4326, with the longitude first, or the columns in a header"
+            )
         if not np.isfinite(converted).all():
             first = points[~np.isfinite(converted).all(axis=1)][0]
             raise SceneError(
                 f"{where}: {_words(first)} cannot be converted from {source.name} to {wanted.name}: "
-                + ("that is local" if wanted.is_engineering else "is the longitude first?")
+                + _why_not(first, source, wanted)
             )
         if transformer is not None and len(points):
             _tell_of_accuracy(transformer, f"{where}: converted to {wanted.name}")
         return converted
 
     return checked
+
+
+def _why_not(point: np.ndarray, source: CRS, wanted: CRS) -> str:
+    """Why a point may have no conversion."""
+    if wanted.is_engineering or source.is_engineering:
+        return "that is local" if wanted.is_engineering else "the first is local"
+    if source.is_geographic and np.abs(point[:2]).max() > 360:
+        return "these are no degrees, name their own system"
+    return "is the longitude first?"
 
 
 def _tell_of_accuracy(operation: Transformer, what: str) -> None:

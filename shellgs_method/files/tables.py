@@ -44,6 +44,7 @@ _SYSTEM = re.compile(
     re.IGNORECASE,
 )
 """What a header holds that is meant to name a system."""
+_MINUTES = re.compile(r"\d\s*(°|deg)\s*\d")
 _QUOTED = re.compile(r"""^(["'])(.*)\1$""")
 _DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*\d,\d+,?")
 
@@ -90,10 +91,10 @@ class Table:
         comments = _comments_in([line for _, line in lines], path)
         worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
         systems = [comment for comment in comments if names_system(comment)]
-        width = len(cells_of(worded[0][1])) if worded else 0
+        width = next((len(cells_of(words)) for _, words in worded if not _is_header(words)), 0)
         named = (cells for cells in (_titles(line.split()) for line in comments) if len(cells) == width)
         titles = next((cells for cells in named if _are_axes(cells, "XYZ")), [])
-        if worded and _is_header(worded[0][1]):
+        if worded and _is_header(worded[0][1]) and not (titles and "" in cells_of(worded[0][1])):
             words = worded.pop(0)[1]
             header = " ".join(words)
             if _SYSTEM.search(header):
@@ -167,7 +168,8 @@ class Table:
         """The cells of each line by their roles, after its position, for messages; those of coordinates are numbers.
 
         A line of fewer words than the header has must end where all that is needed has been named, if that comes first:
-        which of the others are missing cannot be told.
+        which of the others are missing cannot be told. Lines whose cells of coordinates are all empty are left out,
+        which is reported.
 
         Args:
             columns: by :meth:`columns`.
@@ -181,7 +183,11 @@ class Table:
         width = max(len(self.titles), columns.get("name", 0) + 1) if self.names_axes else None
         split = [cells_of(words) for _, words in self.lines]
         whole = not any("." in cell for cells in split for cell in cells if are_numbers([cell]))
+        without: list[str] = []
         for (where, words), separated in zip(self.lines, split, strict=True):
+            if len(separated) > 1 and not any(dict(enumerate(separated)).get(columns[role]) for role in numeric):
+                without.append(where)  # as of photographs without a reference
+                continue
             both = (
                 {role: dict(enumerate(cells)).get(k, "") for role, k in columns.items()} for cells in (words, separated)
             )
@@ -195,11 +201,15 @@ class Table:
                     slip = "; its commas are decimal: write decimal points"
                 elif fewer:
                     slip = f"; it has {len(words)} words: put semicolons between cells of which some are empty"
+                if _MINUTES.search(" ".join(words)):
+                    slip = "; its degrees are in minutes and seconds: write decimal degrees (exiftool -n)"
                 raise SceneError(f"{where}: expected {expected}{slip}")
             digits = list(takewhile(str.isdigit, separated[columns["X"] :]))
             if whole and not width and len(separated) > len(words) and len(digits) > len(numeric):
                 raise SceneError(f"{where}: its commas separate columns, or are decimal: write decimal points")
             yield where, row
+        if without:
+            notice(f"{without[0]} has no coordinates, as {len(without)} of {len(split)} lines: they are left out.")
 
     def to_shell(self, crs: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
         """Conversion of the coordinates to the shell's.
@@ -266,7 +276,8 @@ def _lines_of(text: str) -> list[str]:
 
 def _comments_in(lines: Sequence[str], path: Path) -> list[str]:
     """Contents of lines that begin with #; those that look like rows are reported."""
-    numbered = (re.split(r"[\s,;]+", line) for line in lines if re.match(r"\s*#\w", line))
+    rows = (line for line in lines if re.match(r"\s*#\w", line) and not _SYSTEM.search(line))
+    numbered = (re.split(r"[\s,;]+", line) for line in rows)
     if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
         notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")
     return [line.lstrip("# \t").rstrip() for line in lines if line.lstrip().startswith("#")]

@@ -249,6 +249,48 @@ def test_a_header_or_comment_of_positions_chooses_columns_and_system(tmp_path, t
     np.testing.assert_allclose(read_positions(tmp_path / "geo.txt", [view], "EPSG:25832").shell, truth, atol=1e-3)
 
 
+@pytest.mark.parametrize("system", ["EPSG:32632", "WGS84 UTM 32N", "EPSG:2056"])
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2]])
+def test_degrees_that_are_said_to_be_metres_are_refused(tmp_path, system, order):
+    """As in a geo.txt of OpenDroneMap whose first line names the system of the result."""
+    view, truth = rig()[0][0], np.array([[410000.5, 5413000.25, 251.0]])
+    (tmp_path / "geo.txt").write_text(f"{system}\n{view.name} {' '.join(map(str, degrees_of(truth)[0][order]))}\n")
+    with pytest.raises(SceneError, match=r"is said to be in .*, but is longitude and latitude in the area of ETRS89"):
+        read_positions(tmp_path / "geo.txt", [view], "EPSG:25832")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("EPSG:4326\n{} 410000.5 5413000.25 251", "these are no degrees, name their own system"),
+        ('{},"48 deg 8\' 12.34"" N","11 deg 30\' 1.00"" E",515 m', "in minutes and seconds: write decimal degrees"),
+    ],
+)
+def test_coordinates_in_another_notation_are_refused_with_the_remedy(tmp_path, text, sentence):
+    view = rig()[0][0]
+    (tmp_path / "geo.txt").write_text(text.format(view.name))
+    with pytest.raises(SceneError, match=sentence):
+        read_positions(tmp_path / "geo.txt", [view], "EPSG:25832")
+
+
+@pytest.mark.parametrize("header", ["#Label,Y/Northing,X/Easting,Z/Altitude,Error", "image,y,x,z,error"])
+def test_photographs_without_a_reference_are_left_out_and_told(rigged, tmp_path, caplog, header):
+    """As Metashape lists them; the first of them is no header."""
+    (tmp_path / "geo.txt").write_text(f"{header}\nimages/0.png,,,,\nimages/1.png,5,4,6,0.1\n")
+    found = read_positions(tmp_path / "geo.txt", rigged[0])
+    np.testing.assert_array_equal(found.shell, [[4, 5, 6]])
+    assert [view.name for view in found.views] == ["images/1.png"]
+    assert "line 2 has no coordinates, as 1 of 2 lines: they are left out" in caplog.text
+
+
+def test_a_comment_that_names_a_system_is_no_row(tmp_path, caplog):
+    view = rig()[0][0]
+    system = pyproj.CRS("EPSG:25832").to_wkt("WKT1_GDAL")
+    (tmp_path / "geo.txt").write_text(f"#CoordinateSystem: {system}\n{view.name} 410000 5413000 251\n")
+    assert read_positions(tmp_path / "geo.txt", [view], "EPSG:25832").shell.tolist() == [[410000, 5413000, 251]]
+    assert not caplog.text
+
+
 def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):
     views = rig()[0]
     (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{views[0].name} 48.9 190 251\n")
