@@ -1093,12 +1093,21 @@ def test_a_scan_of_an_e57_without_a_pose_tells_no_scanner(tmp_path: Path):
     assert len(read.vertices) == 600
 
 
-def save_e57_columns(path: Path, columns: dict[str, np.ndarray], pose: dict[str, dict[str, float]]) -> Path:
-    """Write a scan of an E57 by libe57 itself: any fields, and a pose with its numbers in any order."""
+def save_e57_columns(path: Path, *scans: tuple[dict[str, np.ndarray], dict[str, dict[str, float]]]) -> Path:
+    """Write scans of an E57 by libe57 itself: any fields, and poses with their numbers in any order."""
     libe57 = pytest.importorskip("pye57").libe57
     file = libe57.ImageFile(str(path), "w")
-    scan, fields, scans = libe57.StructureNode(file), libe57.StructureNode(file), libe57.VectorNode(file, True)
-    file.root().set("data3D", scans)
+    file.root().set("data3D", written := libe57.VectorNode(file, True))
+    for columns, pose in scans:
+        add_e57_scan(libe57, file, written, columns, pose)
+    file.close()
+    return path
+
+
+def add_e57_scan(
+    libe57: Any, file: Any, scans: Any, columns: dict[str, np.ndarray], pose: dict[str, dict[str, float]]
+) -> None:
+    scan, fields = libe57.StructureNode(file), libe57.StructureNode(file)
     scans.append(scan)
     if pose:
         scan.set("pose", placed := libe57.StructureNode(file))
@@ -1113,10 +1122,18 @@ def save_e57_columns(path: Path, columns: dict[str, np.ndarray], pose: dict[str,
     points = libe57.CompressedVectorNode(file, fields, libe57.VectorNode(file, True))
     scan.set("points", points)
     writer = points.writer(buffers)
-    writer.write(len(next(iter(columns.values()))))
+    if count := len(next(iter(columns.values()))):
+        writer.write(count)
     writer.close()
-    file.close()
-    return path
+
+
+def test_scans_of_an_e57_without_points_or_coordinates_are_passed_over(tmp_path: Path, caplog):
+    """As of scanners that saw nothing, or of panoramas; libE57 refuses to read none."""
+    columns = {f"cartesian{axis}": POINTS[:, k].astype(np.float64) for k, axis in enumerate("XYZ")}
+    empty, grey = {name: column[:0] for name, column in columns.items()}, {"intensity": np.ones(7)}
+    path = save_e57_columns(tmp_path / "a.e57", (empty, {}), (grey, {}), (columns, {}), (empty, {}))
+    np.testing.assert_allclose(read_geometry(path).vertices, POINTS)
+    assert f"left out 7 of {7 + len(POINTS)} points, which have no coordinates" in caplog.text
 
 
 def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_path: Path):
@@ -1124,7 +1141,7 @@ def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_pat
     elevations = np.arcsin(POINTS[:, 2] / ranges)
     columns = {"Range": ranges, "Azimuth": np.arctan2(POINTS[:, 1], POINTS[:, 0]), "Elevation": elevations}
     columns = {f"spherical{name}": np.append(column, np.zeros(20)) for name, column in columns.items()}
-    path = save_e57_columns(tmp_path / "a.e57", columns, {})
+    path = save_e57_columns(tmp_path / "a.e57", (columns, {}))
     np.testing.assert_allclose(read_geometry(path).vertices, POINTS, atol=1e-5)
 
 
@@ -1133,7 +1150,7 @@ def test_the_pose_of_an_e57_is_read_by_its_names(tmp_path: Path, quaternion: str
     turn, shift = dict(zip("xyzw", TURNED.as_quat().tolist(), strict=True)), dict(zip("xyz", NATIONAL, strict=True))
     parts = {"rotation": {name: turn[name] for name in quaternion}, "translation": {axis: shift[axis] for axis in axes}}
     columns = {f"cartesian{axis}": POINTS[:, k].astype(np.float64) for k, axis in enumerate("XYZ")}
-    path = save_e57_columns(tmp_path / "a.e57", columns, {name: part for name, part in parts.items() if part})
+    path = save_e57_columns(tmp_path / "a.e57", (columns, {name: part for name, part in parts.items() if part}))
     expected = (TURNED.apply(POINTS) if quaternion else POINTS) + (NATIONAL if axes else 0)
     np.testing.assert_allclose(read_geometry(path).vertices, expected, atol=1e-5)
 

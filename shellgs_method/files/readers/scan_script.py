@@ -65,6 +65,11 @@ def read_e57(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piec
     file = pye57.E57(path)
     for index in range(file.scan_count):
         header = file.get_header(index)
+        if header.point_count == 0:  # which libE57 refuses to read
+            continue
+        if not {"cartesianX", "sphericalRange"} & {*header.point_fields}:
+            left_out["points, which have no coordinates"] += header.point_count
+            continue
         rotation, translation = _pose(header)
         if translation.any() or not np.array_equal(rotation, np.eye(3)):
             yield NO_POINTS, translation[None], NO_COLOURS
