@@ -286,6 +286,7 @@ def test_extensions_of_materials_do_not_matter(tmp_path: Path):
         (lambda gltf: gltf["bufferViews"][0].update(byteLength=10**6), "shorter than the json claims"),
         (lambda gltf: gltf["accessors"][0].update(count=10**9), "cannot be read"),
         (lambda gltf: gltf["nodes"][0].update(children=[0]), "placed twice"),
+        (lambda gltf: gltf["nodes"][0].update(matrix=[1, 0, 0, 5, *np.eye(4).ravel()[4:]]), "is written row by row"),
         (lambda gltf: gltf["accessors"][0].update(count=4), "outside its 4 vertices"),
         (lambda gltf: gltf["accessors"][0].pop("bufferView"), "accessor 0 has no values"),
         (lambda gltf: gltf.update(accessors=[]), "cannot be read"),

@@ -171,7 +171,10 @@ class _Document:
 
     def _pose(self, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
         if "matrix" in node:
-            return np.array(node["matrix"], np.float64).reshape(4, 4).T
+            pose = np.array(node["matrix"], np.float64).reshape(4, 4).T
+            if not np.allclose(pose[3], [0, 0, 0, 1]):
+                raise ValueError("the matrix of a node is written row by row: transpose it, or export again")
+            return pose
         return _poses({name: np.array([node[name]], np.float64) for name in _STILL.keys() & node.keys()}, 1)[0]
 
     def _instances(self, node: dict[str, Any]) -> Float64[np.ndarray, "I 4 4"]:
