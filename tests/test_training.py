@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import json
 import math
@@ -442,6 +443,27 @@ def test_a_run_that_is_resumed_with_other_settings_is_told(pristine_scene, tmp_p
     others = "other settings (pipeline.datamanager.holdout: none, now A; pipeline.datamanager.band_width: 2.0, now 1.0)"
     assert (others in caplog.text) is ("other settings" in caplog.text) is told
     assert (f"--load-config {first.config.get_base_dir() / 'config.yml'} --load-dir" in caplog.text) is told
+
+
+def test_a_resumed_run_has_its_own_learning_rates(pristine_scene, tmp_path):
+    def faster(config):
+        config.optimizers = copy.deepcopy(config.optimizers)
+        for name in ("means", "scales"):
+            config.optimizers[name]["optimizer"].lr *= 4
+
+    first = trainer_of(pristine_scene, tmp_path / "first", "photo_gs", iterations=2)
+    first.train()
+    again = trainer_of(pristine_scene, tmp_path / "second", "photo_gs", 8, first.checkpoint_dir, faster)
+    means, scales = (again.optimizers.optimizers[name] for name in ("means", "scales"))
+    start, end = (
+        again.config.optimizers["means"]["optimizer"].lr,
+        again.config.optimizers["means"]["scheduler"].lr_final,
+    )
+    assert means.param_groups[0]["lr"] == pytest.approx(start * (end / start) ** (2 / 8))
+    assert scales.param_groups[0]["lr"] == again.config.optimizers["scales"]["optimizer"].lr
+    assert means.state[model_of(again).means]["step"] == 2
+    again.train()
+    assert means.param_groups[0]["lr"] == pytest.approx(end)
 
 
 def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_path):

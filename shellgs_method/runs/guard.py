@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from shellgs_method.machine.constants import constant
 
@@ -66,3 +70,21 @@ class GuardedOptimizers(Optimizers):
             if not all(each.defaults.get("fused") for each in self.optimizers.values()) and skipped.item():
                 return
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+    def load_optimizers(self, loaded_state: Mapping[str, Any]) -> None:
+        """Load the moments of a checkpoint; learning rates and other settings stay those of this run."""
+        for name, state in loaded_state.items():
+            optimizer = self.optimizers[name]
+            optimizer.load_state_dict(state | {"param_groups": optimizer.state_dict()["param_groups"]})
+
+    def load_schedulers(self, loaded_state: Mapping[str, Any]) -> None:
+        """Load how far the schedules of a checkpoint are; where they begin and end stays as in this run."""
+        for name, state in loaded_state.items():
+            scheduler = self.schedulers[name]
+            scheduler.load_state_dict(state | {"base_lrs": scheduler.base_lrs})
+            rates = scheduler.get_last_lr()
+            if isinstance(scheduler, LambdaLR):  # others know their rate as a multiple of the last one only
+                pairs = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
+                rates = [base * share(scheduler.last_epoch) for base, share in pairs]
+            for group, rate in zip(scheduler.optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate
