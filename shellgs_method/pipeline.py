@@ -242,11 +242,18 @@ class FacadePipeline(VanillaPipeline):
         """
         self._training_state = state
         trained_with, data = BoundCameras.from_json(state.get("cameras", {})), self.datamanager
-        if self.test_mode != "val" and (changed := trained_with.changed(data.train_dataset.views)):
-            raise SceneError(
-                f"the cameras of {data.config.dataparser.data} are not those that the run was trained with: {changed}; "
-                "name the model of those as colmap_path in its config.yml, or train again"
-            )
+        if changed := trained_with.changed(data.train_dataset.views):
+            scene = data.config.dataparser.data
+            if self.test_mode == "val":
+                notice(
+                    f"the cameras of {scene} are not those that the checkpoint was trained with: {changed}; its "
+                    "surface follows the old ones, and training continues with the new: train again from the start."
+                )
+            else:
+                raise SceneError(
+                    f"the cameras of {scene} are not those that the run was trained with: {changed}; name the model of "
+                    "those as colmap_path in its config.yml, or train again"
+                )
         block = state.get("block") or {}
         if self.test_mode != "val" and block and block["region"] != self._cell().fingerprint:
             raise SceneError(f"{block['name']} has been cut again since the run was trained: train it again")

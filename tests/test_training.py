@@ -466,6 +466,23 @@ def test_a_resumed_run_has_its_own_learning_rates(pristine_scene, tmp_path):
     assert means.param_groups[0]["lr"] == pytest.approx(end)
 
 
+@pytest.mark.parametrize(("turned", "told"), [(0.0, False), (3.0, True)])
+def test_a_resumed_run_is_told_of_a_camera_that_has_changed(pristine_scene, tmp_path, caplog, turned, told: bool):
+    scene = Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
+    first = trainer_of(scene, tmp_path / "first", "photo_gs", iterations=2)
+    first.train()
+    path = scene / "transforms.json"
+    cameras = json.loads(path.read_text())
+    pose = np.array(cameras["frames"][5]["transform_matrix"])
+    pose[:3, :3] @= Rotation.from_euler("y", turned, degrees=True).as_matrix()
+    cameras["frames"][5]["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(cameras))
+    trainer_of(scene, tmp_path / "second", "photo_gs", 4, first.checkpoint_dir)
+    name = cameras["frames"][5]["file_path"]
+    words = f"the cameras of {scene} are not those that the checkpoint was trained with: that of {name} was turned"
+    assert (words in caplog.text) is told
+
+
 def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_path):
     again = trainer_of(pristine_scene, tmp_path, iterations=60, load_dir=trained.checkpoint_dir)
     again.train()
