@@ -83,7 +83,32 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
         where = f" All of its output is in {run.folder / 'log.txt'}."
         console.print(Text.assemble((f"{run.label} failed.", "red"), where))
         console.print(why, markup=False)
+        if advice := remedy(run, why):
+            console.print(advice, style="yellow", markup=False)
     return comparison
+
+
+def remedy(run: Run, why: str) -> str | None:
+    """What to do about the usual failures of other nerfstudio methods, which end in a traceback; None if it is not one.
+
+    Args:
+        run: the run that failed.
+        why: the end of its output.
+    """
+    method = run.variant.method
+    if run.variant.ours:
+        return None
+    if any(words in why for words in ("Found no NVIDIA driver", "not compiled with CUDA enabled")):
+        return (
+            f"{method} was to train on a GPU, and none is found here: leave it out, or, if it can train on the CPU as "
+            f"nerfacto can, give it as {method}-cpu='{method} --machine.device-type cpu'."
+        )
+    if "URLError" in why:
+        return (
+            f"{method} downloads a file at its start, and the network cannot be reached: leave it out, or put the file "
+            "where it is looked for (`shellgs doctor` names that of LPIPS, which nerfacto needs)."
+        )
+    return None
 
 
 def _remove_damaged(run: Run, console: Console) -> None:

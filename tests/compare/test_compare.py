@@ -300,6 +300,27 @@ def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
     assert [run.finished for run in runs] == [False, True, True]
 
 
+@pytest.mark.parametrize(
+    ("name", "why", "advice"),
+    [
+        ("splatfacto", "RuntimeError: Found no NVIDIA driver on your system.", "splatfacto was to train on a GPU"),
+        ("nerfacto", "AssertionError: Torch not compiled with CUDA enabled", "nerfacto was to train on a GPU"),
+        ("nerfacto", "urllib.error.URLError: <urlopen error [Errno -2]>", "nerfacto downloads a file at its start"),
+        ("nerfacto", "ValueError: another fault", None),
+        ("photo-gs", "RuntimeError: Found no NVIDIA driver on your system.", None),
+    ],
+)
+def test_a_method_of_others_without_gpu_or_network_is_told_what_to_do(
+    pristine_scene, tmp_path, monkeypatch, name, why, advice: str | None
+):
+    monkeypatch.setattr(results, "write_results", lambda *_: Comparison([], {}, {}))
+    (run,) = fake_grid([pristine_scene], [name], tmp_path)
+    output = io.StringIO()
+    compare([run], lambda _: {run: why}, tmp_path / "out", Console(file=output, width=1000))
+    told = output.getvalue().partition(why)[2].strip()
+    assert told.startswith(advice) if advice else not told
+
+
 @pytest.mark.usefixtures("fake_commands")
 @pytest.mark.parametrize("terminal", [False, True])
 def test_the_console_shows_that_results_are_written(pristine_scene, tmp_path, terminal):
