@@ -75,7 +75,9 @@ class GuardedOptimizers(Optimizers):
         """Load the moments of a checkpoint; learning rates and other settings stay those of this run."""
         for name, state in loaded_state.items():
             optimizer = self.optimizers[name]
-            optimizer.load_state_dict(state | {"param_groups": optimizer.state_dict()["param_groups"]})
+            ours = optimizer.state_dict()["param_groups"]
+            groups = [then | now for then, now in zip(state["param_groups"], ours, strict=True)]
+            optimizer.load_state_dict(state | {"param_groups": groups})
 
     def load_schedulers(self, loaded_state: Mapping[str, Any]) -> None:
         """Load how far the schedules of a checkpoint are; where they begin and end stays as in this run."""
