@@ -9,9 +9,11 @@ from shellgs_method.evaluation.image import image_errors, lpips_network
 from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces
 from shellgs_method.evaluation.view import Rendering, geometry_errors, mean_over_views
 from shellgs_method.evaluation.visualization import geometry_images
+from shellgs_method.geometry.reference import Reference
 
 __all__ = [
     "NormalErrors",
+    "Reference",
     "Rendering",
     "SurfaceComparison",
     "angular_error",

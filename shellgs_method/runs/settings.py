@@ -27,7 +27,7 @@ def config_settings(config: TrainerConfig) -> dict[str, Any]:
 def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """The first settings that are others now, in words; empty if all are the same."""
     changed = [key for key in now if before.get(key, now[key]) != now[key]]
-    return "; ".join(f"{key}: {str(before[key])[:12]}, now {str(now[key])[:12]}" for key in changed[:5])
+    return "; ".join(f"{key}: {str(before[key])[:60]}, now {str(now[key])[:60]}" for key in changed[:5])
 
 
 def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
