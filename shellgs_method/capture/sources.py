@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -30,6 +31,7 @@ VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3g
 """Suffixes of videos, in lower case."""
 _PLACEHOLDER = ".icloud"  # of a hidden file in the place of one that macOS keeps elsewhere: .IMG_0001.HEIC.icloud
 _MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal, ExifTags.Base.Make, ExifTags.Base.Model)
+_THERMAL = re.compile(r"DJI_[\d_]*\d_(T|THRM)(_.*)?", re.IGNORECASE)  # before a name of a waypoint
 _IN_ORDER = 0.5  # of the steps from one name to the next, that are between neighbours by time
 # Pixels of a side, and mean difference as a share of the contrast, by which photographs are compared: copies have 0.11
 # at most, at a tenth of the light, others 0.28 and more.
@@ -42,7 +44,7 @@ _SAME = 0.3  # pixels by which pictures may seem moved that show the same: those
 
 
 def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]:
-    """The photographs in a folder and its sub-folders, by their names in the scene; reports others, maps and copies.
+    """The photographs in a folder and its sub-folders, by their names in the scene; reports what is left out.
 
     Args:
         folder: the folder.
@@ -61,7 +63,7 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
             photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
     found: dict[str, Path] = {}
     _tell_what_is_left_out(folder, photographs)
-    for path in _without_copies(folder, _without_maps(folder, photographs)):
+    for path in _without_copies(folder, _without_maps(folder, _without_thermal(folder, photographs))):
         name = captured_name(path.relative_to(folder))
         if name in found:
             raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
@@ -89,6 +91,19 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
         raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
     if counted:
         notice(f"{others.total()} files of {folder} are not photographs, and are left out ({counted}).")
+
+
+def _without_thermal(folder: Path, photographs: Sequence[Path]) -> list[Path]:
+    """Photographs without the thermal images that drones of DJI store beside them, which are reported."""
+    visible = [path for path in photographs if not _THERMAL.fullmatch(path.stem)]
+    if not visible or len(visible) == len(photographs):
+        return [*photographs]
+    first = next(path for path in photographs if path not in visible)
+    notice(
+        f"{len(photographs) - len(visible)} files of {folder} are thermal images, by their names, and are left out: "
+        f"{first.relative_to(folder)}, for example."
+    )
+    return visible
 
 
 def _without_maps(folder: Path, photographs: Sequence[Path]) -> list[Path]:

@@ -119,6 +119,16 @@ def test_maps_of_depth_and_confidence_beside_photographs_in_colour_are_left_out_
     ) == in_colour
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_thermal_images_of_a_drone_beside_its_photographs_are_left_out_and_told(tmp_path, caplog, alone):
+    thermal = ["DJI_20240501120000_0001_T.JPG", "DJI_0002_THRM.jpg", "DJI_20240501120000_0003_T_Waypoint1.JPG"]
+    others = [] if alone else ["DJI_20240501120000_0001_W.JPG", "DJI_0004_Z.jpg", "DJI_0005.jpg"]
+    for number, name in enumerate([*thermal, *others]):
+        photograph(64 + number, 48).save(tmp_path / name)
+    assert sorted(find_photographs(tmp_path)) == sorted(others or thermal)
+    assert ("3 files of" in caplog.text and "are thermal images" in caplog.text) is not alone
+
+
 @pytest.mark.parametrize(("name", "colour"), [("a_mask.png", 0), ("a_mask.JPG", 0), ("a.png", (128, 64, 128))])
 def test_masks_and_labels_of_three_channels_beside_photographs_are_left_out_and_told(tmp_path, caplog, name, colour):
     """As for OpenDroneMap; masks as JPEG have noise."""
