@@ -46,8 +46,10 @@ STEADY = 100.0
 along that slope: that of 10 square metres over 10 metres."""
 LEAST = 5.0
 """Area in square metres, measured, below which the ground is taken for level at height 0."""
-STREETS = 3
-"""Number of level surfaces that are looked at: a street, one above it, a roof."""
+STREETS = 6
+"""Number of level surfaces that are looked at: a street, one above it, a roof, and errors of the depth."""
+LARGE = 0.1
+"""Area relative to that of the largest level surface, from which one may be the ground that a drone flies over."""
 STANDING = 3.0
 """Height in metres up to which a camera is carried by somebody who stands on the ground below it."""
 ASIDE = 5.0
@@ -274,7 +276,7 @@ def _streets(points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], 
 
 
 def _stood_on(streets: list[_Street], eyes: Float64[np.ndarray, "E 3"], grid: _Grid) -> list[_Street]:
-    """The streets that cameras stand on, each on one; if they stand on none, the lowest."""
+    """The streets that cameras stand on, each on one; if they stand on none, the lowest of the large ones."""
     found, cells, free = [], grid.cells(eyes), np.ones(len(eyes), bool)
     for street in streets:
         above = eyes[:, 2] - street.nearest.ravel()[cells]
@@ -282,7 +284,8 @@ def _stood_on(streets: list[_Street], eyes: Float64[np.ndarray, "E 3"], grid: _G
         if stand.mean() >= STOOD_ON:
             found.append(street)
             free &= ~stand
-    return found or sorted(streets, key=lambda street: np.nanmedian(street.measured))[:1]
+    large = [street for street in streets if street.area > LARGE * max(each.area for each in streets)]
+    return found or sorted(large, key=lambda street: np.nanmedian(street.measured))[:1]
 
 
 def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:

@@ -290,6 +290,13 @@ def test_a_street_and_that_above_its_wall_are_both_ground_where_cameras_stand_on
     assert Ground.of(streets, above).at(places)[1] == pytest.approx(4, abs=0.03)
 
 
+def test_what_errors_of_the_depth_put_below_the_ground_is_not_it():
+    street = level_points((-8, 8), (-12, 0), 0.0)
+    below = [level_points((x, x + 2), (y, y + 4), z) for x, y, z in ((-9, -16, -4.0), (-2, -16, -6.0), (5, -16, -8.0))]
+    made = Ground.of(np.concatenate([street, *below]), EYES + np.array([0, 0, 18]))
+    assert abs(made.at(np.array([[0.0, -4]]))[0]) < 0.03
+
+
 def test_a_flat_roof_below_a_drone_is_not_the_ground():
     roof, street = level_points((-8, 8), (0, 14), 9.0), level_points((-8, 8), (-5, 0), 0.0)
     made = Ground.of(np.concatenate([roof, street]), EYES + np.array([0, 4, 18]))
